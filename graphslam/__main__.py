@@ -24,9 +24,9 @@ def start() -> None:
     try:
         from graphslam.app.cli import main as command_line
     except (ImportError, MemoryError, OSError, RuntimeError, SystemError) as error:
-        said = " ".join(str(error).split()) or type(error).__name__
+        text = " ".join(str(error).split()) or type(error).__name__
         if sys.stderr is not None:
-            sys.stderr.write(f"graphslam: cannot be loaded: not enough memory, or a damaged installation. {said}\n")
+            sys.stderr.write(f"graphslam: cannot be loaded: not enough memory, or a damaged installation. {text}\n")
         sys.exit(1)
     signal.signal(signal.SIGINT, python)
     command_line()

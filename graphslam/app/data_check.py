@@ -37,17 +37,17 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     if not isinstance(log, SensorLog):
         text = f"{source}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
         return [StreamFinding("", Finding("", "read", text))]
-    said = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
-    said += [
+    findings = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
+    findings += [
         StreamFinding("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)
     ]
-    said += check_log(log)
+    findings += check_log(log)
     try:
         choice = choose_front_end(log)
-        said.append(StreamFinding("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))
+        findings.append(StreamFinding("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))
     except MissingDataError as error:
-        said.append(StreamFinding("", Finding("look", "no-front-end", str(error))))
-    return said
+        findings.append(StreamFinding("", Finding("look", "no-front-end", str(error))))
+    return findings
 
 
 def _lost(log: SensorLog) -> list[tuple[str, int]]:

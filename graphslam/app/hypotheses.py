@@ -149,10 +149,10 @@ def minimum_entropy_topology(
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
     values = read_options(run.folder)
-    said = values["run"]
-    if said["frontend"] != SegSlam.name:
-        raise ConfigError(f"front end {said['frontend']!r} tells one topology; only {SegSlam.name!r} tells several")
-    source = log_of_run(said, log)
+    settings = values["run"]
+    if settings["frontend"] != SegSlam.name:
+        raise ConfigError(f"front end {settings['frontend']!r} tells one topology; only {SegSlam.name!r} tells several")
+    source = log_of_run(settings, log)
     front: Any = make_front_end(SegSlam.name, values["frontend"])
     config, streams = _graph_options(run)
     reach = sensor_reach(values)
@@ -162,7 +162,7 @@ def minimum_entropy_topology(
             bar.total = at.steps
             bar.update(at.step - bar.n)
 
-        result = front.result(source, seed=SeedTree(said["seed"]).child("frontend"), watch=watch)
+        result = front.result(source, seed=SeedTree(settings["seed"]).child("frontend"), watch=watch)
     told, left_out = hypotheses_of(result, most, drift=front.config.drift, handover=front.config.segslam.handover)
     alternatives = solve_hypotheses(
         told,
@@ -182,15 +182,15 @@ def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> 
     if run.folder is None:
         return found
     found, options = _refined(run, run.folder, found, submaps), RunOptions.of_folder(run.folder)
-    graph, r, said = found.choice.best.alternative.graph, found.refined, list(found.findings)
+    graph, r, findings = found.choice.best.alternative.graph, found.refined, list(found.findings)
     if (rows := options.table("control")) is not None:
         facts = control_facts(graph, rows)
-        said += control_findings({"control_points": facts})
-        said += [] if r is None else [left_out_of_refinement(0, facts["used"])]
+        findings += control_findings({"control_points": facts})
+        findings += [] if r is None else [left_out_of_refinement(0, facts["used"])]
     if (rows := options.table("check")) is not None:
         tested = check_points(graph, rows, None if r is None else (r.refinement, r.map.trajectory))
-        said += control_findings({"check_points": tested.facts()})
-    return replace(found, findings=said)
+        findings += control_findings({"check_points": tested.facts()})
+    return replace(found, findings=findings)
 
 
 def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
@@ -206,12 +206,12 @@ def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
         gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))
-    refined, said = refine_run(config, taken.scans, submaps, solved, gps=gps)
+    refined, findings = refine_run(config, taken.scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
-        return replace(found, refined=refined, findings=said)
+        return replace(found, refined=refined, findings=findings)
     options: MapConfig = build_config(MapConfig, values.get("map", {}), "map")
     made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=sensor_reach(values), config=options)
-    return replace(found, refined=refined, refined_map=made, findings=said)
+    return replace(found, refined=refined, refined_map=made, findings=findings)
 
 
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:

@@ -34,8 +34,8 @@ def join_verdict(row: Mapping[str, Any], estimate: MapEstimate) -> list[Finding]
         out.append(Finding("", "chi2", text))
     if nees := judged.get("nees"):
         before: Any = row.get("nees_unpolished")
-        said = f"; before refinement {before / nees.dof:.3g}" if is_finite_number(before) else ""
-        out.append(Finding(nees.level, "nees", f"NEES (ground truth): {nees.text}{said}."))
+        note = f"; before refinement {before / nees.dof:.3g}" if is_finite_number(before) else ""
+        out.append(Finding(nees.level, "nees", f"NEES (ground truth): {nees.text}{note}."))
     return out
 
 

@@ -66,8 +66,8 @@ class LiveView(Observer):
         colour = BELIEVED if decision.verdict == "accepted" else DOUBTED
         line = self.rr.LineStrips3D([raise_points(ends)], colors=[colour], labels=[decision.verdict])
         self.stream.log(f"map/loops/{decision.loop}", line)
-        said = f"loop {decision.loop}, submaps {decision.submap_i} and {decision.submap_j}: {decision.verdict}"
-        self.stream.log("said", self.rr.TextLog(f"{said}, {decision.why}" if decision.why else said))
+        text = f"loop {decision.loop}, submaps {decision.submap_i} and {decision.submap_j}: {decision.verdict}"
+        self.stream.log("said", self.rr.TextLog(f"{text}, {decision.why}" if decision.why else text))
 
     def solved(self, solution: Solution) -> None:
         """Send the poses of the optimum and close the recording."""

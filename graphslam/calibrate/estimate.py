@@ -190,13 +190,13 @@ class Calibration:
             right = supported == "all" or alike
             out.append(Finding("", "calibrated", text) if right else Finding("look", "calibration-refused", text))
         for e in self.estimates:
-            said = estimate_text(e.name, e.value, e.sigma)
+            estimate = estimate_text(e.name, e.value, e.sigma)
             if e.applied:
                 how = f"{CORRECTION_VERBS[e.name]} (log-likelihood +{e.gain:.0f} nats)"
-                text = f"calibration from {self.data}: {said} — {how}."
+                text = f"calibration from {self.data}: {estimate} — {how}."
                 out.append(Finding("", "calibrated", text))
             elif e.why_not != "not significant":
-                text = f"calibration from {self.data}: {said} — not corrected: {e.why_not}."
+                text = f"calibration from {self.data}: {estimate} — not corrected: {e.why_not}."
                 out.append(Finding("look", "calibration-left", text))
         chance = [NAMES[e.name] for e in self.estimates if e.why_not == "not significant"]
         if chance:

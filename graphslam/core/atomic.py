@@ -69,8 +69,8 @@ def check_file_target(path: str | os.PathLike[str]) -> Path:
     if not os.access(target.parent, os.W_OK | os.X_OK):
         raise OutputError(f"{target}: the folder {target.parent} cannot be written; name a file in another folder")
     for stray in target.parent.glob(f".{glob.escape(target.name)}.*.part*"):
-        said = _PART.fullmatch(stray.name)
-        if said is not None and said["target"] == target.name and not _runs(int(said["process"])):
+        parts = _PART.fullmatch(stray.name)
+        if parts is not None and parts["target"] == target.name and not _runs(int(parts["process"])):
             stray.unlink(missing_ok=True)
     return target
 

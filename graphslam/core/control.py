@@ -131,8 +131,8 @@ class ControlTable:
         out.rows[:] = [r for r in out.rows if r.line not in gone]
         out.refused.sort()
         if not out.rows:
-            said = "; ".join(f"line {line}: {why}" for line, why in out.refused[:5])
-            raise DataError(f"no row can be used ({said or 'there is none'})", where=source, wanted="one row or more")
+            text = "; ".join(f"line {line}: {why}" for line, why in out.refused[:5])
+            raise DataError(f"no row can be used ({text or 'there is none'})", where=source, wanted="one row or more")
         return out
 
 

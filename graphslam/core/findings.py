@@ -68,8 +68,8 @@ def verdict_json(headline: Finding, findings: Iterable[Finding]) -> dict[str, An
 
 def headline_of_json(value: Any) -> Finding | None:
     """The first line of the JSON object that :func:`verdict_json` makes; None if there is none."""
-    said = value if isinstance(value, Mapping) else {}
-    return Finding.from_row({"level": said.get("level"), "code": "headline", "text": said.get("headline")})
+    row = value if isinstance(value, Mapping) else {}
+    return Finding.from_row({"level": row.get("level"), "code": "headline", "text": row.get("headline")})
 
 
 def findings_of_json(value: Any) -> Findings:

@@ -75,8 +75,8 @@ def _take(home: Path) -> Any:
     except BlockingIOError:
         lines = handle.read().splitlines()
         handle.close()
-        said = lines[0].removeprefix(_HEAD).strip() if lines else "unknown"
-        raise RunFolderError(f"{home}: process {said} is writing into it; wait until it has ended") from None
+        owner = lines[0].removeprefix(_HEAD).strip() if lines else "unknown"
+        raise RunFolderError(f"{home}: process {owner} is writing into it; wait until it has ended") from None
     except OSError:  # a file system without locks
         pass
     handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")  # the file stays non-empty: is_empty() reads it

@@ -66,10 +66,10 @@ def html_element(tag: str, *children: Any, **attributes: Any) -> Markup:
     >>> element("p", "a < b", class_="note")
     Markup('<p class="note">a &lt; b</p>')
     """
-    said = {k.rstrip("_"): plain_text(v) for k, v in attributes.items() if v is not None and v != ""}
+    given = {k.rstrip("_"): plain_text(v) for k, v in attributes.items() if v is not None and v != ""}
     inside = [plain_text(c) for c in children if c is not None]
     return Markup(
-        _template(_ELEMENT).render(tag=tag, attributes=said, children=inside, void=tag in ("img", "meta", "br"))
+        _template(_ELEMENT).render(tag=tag, attributes=given, children=inside, void=tag in ("img", "meta", "br"))
     )
 
 

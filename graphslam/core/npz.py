@@ -143,17 +143,17 @@ def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.
     length = int.from_bytes(stream.read(width), "little")
     if length > MOST_HEADER - 12:
         raise ValueError(f"{name} has a header of {length} bytes")
-    said = _HEADER.fullmatch(stream.read(length).decode("latin-1"))
-    if said is None:
+    match = _HEADER.fullmatch(stream.read(length).decode("latin-1"))
+    if match is None:
         raise ValueError(f"{name} has a header that says no plain array")
     try:
-        dtype = np.dtype(said[1])
-        shape = tuple(int(n) for n in said[3].split(",") if n.strip())
+        dtype = np.dtype(match[1])
+        shape = tuple(int(n) for n in match[3].split(",") if n.strip())
     except (TypeError, ValueError):
         raise ValueError(f"{name} has an impossible type or shape") from None
     if len(shape) > 8:
         raise ValueError(f"{name} has {len(shape)} dimensions")
-    return shape, said[2] == "True", dtype, 8 + width + length
+    return shape, match[2] == "True", dtype, 8 + width + length
 
 
 def check_arrays(

@@ -54,10 +54,10 @@ def check_folder_target(path: str | os.PathLike[str], kind: str) -> Path:
 def _listed(home: Path, kind: str) -> list[str]:
     """Files of the earlier output in the folder."""
     if (home / LISTED).is_file():
-        said = read_json(home / LISTED, fmt=_FORMAT, shape={"kind": str, "files": [str]})
-        if said["kind"] == kind:
-            return [_checked(home, name) for name in said["files"]]
-        raise OutputError(f"{home}: holds a {said['kind'][:80]}; wanted a new or empty folder for the {kind}")
+        stored = read_json(home / LISTED, fmt=_FORMAT, shape={"kind": str, "files": [str]})
+        if stored["kind"] == kind:
+            return [_checked(home, name) for name in stored["files"]]
+        raise OutputError(f"{home}: holds a {stored['kind'][:80]}; wanted a new or empty folder for the {kind}")
     others = (n for n in os.listdir(home) if n not in (LOCK, STAGED) and not is_part(n))
     found = next(others, "a lock" if (home / LOCK).exists() and not is_lock(home / LOCK) else None)
     if found is not None:

@@ -337,7 +337,7 @@ class Submap:
         metres, radians = (s[:2], s[2:]) if d == 2 else (s[3:], s[:3])
         lm, sure = self.landmarks, f"σ at most {metres.max():.3g} m and {np.degrees(radians.max()):.3g}°"
         n = 0 if lm is None else len(lm)
-        said = f": end pose {sure}; {n} landmarks, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s"
+        summary = f": end pose {sure}; {n} landmarks, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s"
         path = np.stack([np.zeros(d), self.exit_pose[:d]]) if self.trajectory is None else self.trajectory.positions
         ellipses = [(self.exit_pose[None, :2], P)]
         if lm is not None and d == 2 and n:
@@ -345,4 +345,4 @@ class Submap:
             ellipses.append((lm.positions, lm.dense_covariance()[rows[:, :, None], rows[:, None, :]]))
         seen = lm.positions if lm is not None else None if self.cloud is None else self.cloud.points
         picture = plan_sketch([path], points=seen, ellipses=ellipses)
-        return join_parts([html_element("b", f"Submap {self.key}"), said, picture, pair_list(self.report)])
+        return join_parts([html_element("b", f"Submap {self.key}"), summary, picture, pair_list(self.report)])

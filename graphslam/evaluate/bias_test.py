@@ -240,11 +240,11 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
             for k in np.argsort(-found.reduction)
             if k != best and found.reduction[k] > AS_MUCH * found.reduction[best]
         ]
-        said = [_error_text(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
+        errors = [_error_text(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
         large = abs(found.error[best]) > KINDS[names[best]].careful
-        text = f"systematic residuals: {said[0]}"
-        if len(said) > 1:
-            text += "; or, hardly distinguishable in this run, " + "; or ".join(said[1:])
+        text = f"systematic residuals: {errors[0]}"
+        if len(errors) > 1:
+            text += "; or, hardly distinguishable in this run, " + "; or ".join(errors[1:])
         mends = dict.fromkeys(KINDS[names[k]].mend for k in (best, *others))
         text += f". To do: {'; or '.join(mends)}."
         out.append(Finding("bad" if large else "look", "calibration", text))

@@ -200,8 +200,8 @@ def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
 
     See :meth:`graphslam_frontends.landmarks.summarise.SmoothingResult.nonlinearity`; 0 if no report contains it.
     """
-    said = [(float(r["nonlinearity"]), float(r["unknowns"])) for r in reports if "nonlinearity" in r]
-    return sum(v * n for v, n in said) / sum(n for _, n in said) if said else 0.0
+    rows = [(float(r["nonlinearity"]), float(r["unknowns"])) for r in reports if "nonlinearity" in r]
+    return sum(v * n for v, n in rows) / sum(n for _, n in rows) if rows else 0.0
 
 
 def consistency_tests_of_json(value: Any) -> list[ConsistencyTest]:

@@ -350,11 +350,11 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
 
 def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
     """Final biases, number of nodes, and dropped readings; also as events and drop counts."""
-    said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
+    events: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
     imus = ImuFactors.of(graph)
     for stream in imus.used:
         states = imus.states(stream)
-        mine = [e for e in said if e["stream"] == stream]
+        mine = [e for e in events if e["stream"] == stream]
         for reason, n in (mine[-1]["dropped"] if mine else {}).items():
             drops.drop(stream, f"no factor: {reason}", n)
         if not states.order:

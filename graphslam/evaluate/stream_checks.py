@@ -104,10 +104,10 @@ def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding
     stuck = state == "constant"
     if not stuck and not moved > BENT:
         return []
-    said = "the same for all points of a scan" if stuck else "none"
+    kind = "the same for all points of a scan" if stuck else "none"
     bent = f", which distorts a scan by {moved:.2f} m at the usual speed" if np.isfinite(moved) else ""
     text = (
-        f"point times of {name}: {said}{bent} — scans cannot be deskewed. Switch on point times in the lidar driver, "
+        f"point times of {name}: {kind}{bent} — scans cannot be deskewed. Switch on point times in the lidar driver, "
         "or deskew the scans before."
     )
     return [Finding("bad" if stuck and not moved <= BENT else "look", "points-without-times", text)]

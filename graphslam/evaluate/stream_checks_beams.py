@@ -88,7 +88,7 @@ def _silent(stream: Scanner, name: str, count: npt.NDArray[np.int64]) -> list[Fi
     share = float(none.mean())
     if share < 0.5 and lengths[worst] < SILENT:
         return []
-    said = f"scans of {name} without a return: {int(none.sum())} of {len(t)}"
+    counts = f"scans of {name} without a return: {int(none.sum())} of {len(t)}"
     where = f"longest stretch {lengths[worst]:.1f} s from {t[runs[worst][0]]:.2f} s"
     if isinstance(stream, PointClouds):
         cause = "the clouds are empty"
@@ -99,7 +99,7 @@ def _silent(stream: Scanner, name: str, count: npt.NDArray[np.int64]) -> list[Fi
         cause = f"most beams there are {most}"
         if most == "at or beyond max_range":
             cause += f", {stream.max_range:g} m (are the ranges in millimetres?)"
-    text = f"{said}; {where}; {cause} — the path there is that of the odometry."
+    text = f"{counts}; {where}; {cause} — the path there is that of the odometry."
     return [Finding("bad" if share > 0.5 else "look", "scans-silent", text)]
 
 

@@ -36,8 +36,8 @@ def check_clocks(log: SensorLog) -> list[tuple[str, Finding]]:
     for name, stream in log.streams.items():
         if isinstance(stream, STEADY) and len(stream.times) > 2:
             found = (*_unit(name, stream.times), *_jumps(name, stream.times, log))
-            said = {f.code for _, f in out} & {"pause-bridged"}  # all streams pause together
-            out += [(name, f) for f in found if f.code not in said]
+            codes = {f.code for _, f in out} & {"pause-bridged"}  # all streams pause together
+            out += [(name, f) for f in found if f.code not in codes]
     return [*out, *_overlap(log), *_order(log.read, log.dropped)]
 
 
@@ -85,9 +85,9 @@ def _overlap(log: SensorLog) -> list[tuple[str, Finding]]:
         if common >= TOGETHER * shorter:
             continue
         spans = [f"{n} from {s.times[0]:.3f} to {s.times[-1]:.3f} s" for n, s in ((a, x), (b, y))]
-        said = "no time in common" if common <= 0 else f"only {common:.1f} s in common"
+        extent = "no time in common" if common <= 0 else f"only {common:.1f} s in common"
         text = (
-            f"{a} and {b}: {said} ({spans[0]}, {spans[1]}) — their clocks have different zeros or units, or they are "
+            f"{a} and {b}: {extent} ({spans[0]}, {spans[1]}) — their clocks have different zeros or units, or they are "
             "of two drives. Convert them to one clock."
         )
         out.append((b, Finding("bad", "no-common-time", text)))

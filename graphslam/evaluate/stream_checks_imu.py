@@ -200,7 +200,7 @@ def compare_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding
         )
         return [Finding("look", "turns-disagree", text)]
     out = []
-    said = f"turns of {name}: {found.slope:.3g} ± {found.sigma:.2g} times those of the wheels"
+    result = f"turns of {name}: {found.slope:.3g} ± {found.sigma:.2g} times those of the wheels"
     size = abs(found.slope)
     if not 1.0 / SLIP <= size <= SLIP:
         cause = "one of them is in another unit"
@@ -208,13 +208,13 @@ def compare_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding
             cause = "the gyro seems to be in degrees, wanted rad/s"
         elif abs(np.log(size * 180.0 / np.pi)) < np.log(SLIP):
             cause = "the wheels' yaw rate seems to be in degrees, wanted rad/s"
-        out.append(Finding("bad", "turns-disagree", f"{said} — {cause}."))
+        out.append(Finding("bad", "turns-disagree", f"{result} — {cause}."))
     elif found.slope < 0:
         cause = "left and right wheel are swapped, or a gyro axis is reversed"
-        out.append(Finding("look", "turns-disagree", f"{said} — {cause}."))
+        out.append(Finding("look", "turns-disagree", f"{result} — {cause}."))
     if abs(found.lag) > LATE:
         order = "after" if found.lag > 0 else "before"
-        said = f"turns of {name}: {abs(found.lag):.2f} s {order} those of the wheels"
-        text = f"{said} — their clocks differ."
+        result = f"turns of {name}: {abs(found.lag):.2f} s {order} those of the wheels"
+        text = f"{result} — their clocks differ."
         out.append(Finding("bad", "clocks-disagree", text))
     return out

@@ -245,8 +245,8 @@ class EvidenceGrid(GridTree):
             "voxels occupied / free": f"{counts.occupied:,} / {counts.free:,}",
             "memory, own / shared": f"{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB",
         }
-        said = f" {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
-        return join_parts([html_element("b", "EvidenceGrid"), said, pair_list(facts)])
+        summary = f" {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
+        return join_parts([html_element("b", "EvidenceGrid"), summary, pair_list(facts)])
 
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""

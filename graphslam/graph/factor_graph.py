@@ -86,7 +86,7 @@ class FactorGraph(FactorGraphState):
 
     def _repr_html_(self) -> str:
         score, x, d = self.objective(), self.values.poses, self.dim
-        said = (
+        summary = (
             f": χ² {score.total:.4g} at its values, for {score.dof} degrees of freedom; {len(x)} nodes, "
             f"{len(self.values.landmarks)} landmarks, {len(self.records)} factors"
         )
@@ -95,7 +95,7 @@ class FactorGraph(FactorGraphState):
         links += [pair for b in self.records.blocks for pair in b.ends[b.kept & (np.ptp(b.ends, axis=1) > 1)].tolist()]
         ends = x[np.array(links, dtype=np.intp).reshape(-1, 2), :d]
         picture = plan_sketch([x[:, :d]], points=self.values.landmarks, links=ends)
-        return join_parts([html_element("b", "FactorGraph"), said, picture, Markup(score._repr_html_())])
+        return join_parts([html_element("b", "FactorGraph"), summary, picture, Markup(score._repr_html_())])
 
     @classmethod
     def from_submaps(

@@ -167,9 +167,9 @@ def choose_topics(
     if not {"clouds", "laser"} & chosen.keys() and not {"odometry", "imu", "gps"} & chosen.keys():
         types = Counter({t.type: t.count for t in bag.topics.values() if t.count})
         packets = any(_PACKETS.search(t) for t in types)
-        said = ", ".join(f"{n} {k}" for k, n in types.most_common(8)) or "no message at all"
+        present = ", ".join(f"{n} {k}" for k, n in types.most_common(8)) or "no message at all"
         hint = "; these are raw packets: run the driver of the lidar and record its clouds" if packets else ""
-        raise MissingDataError("no scanner in this bag", where=str(bag.path), got=said, wanted=WANTED + hint)
+        raise MissingDataError("no scanner in this bag", where=str(bag.path), got=present, wanted=WANTED + hint)
     return chosen
 
 

@@ -137,12 +137,12 @@ def read_carmen(
         times=times, ranges=ranges, bearings=scans.bearings, max_range=reach, T_base_sensor=T_base_sensor
     )
     streams = {"laser": scan_stream, **streams}
-    says = "none"
+    reference = "none"
     if corrected is not None:
         index, theirs = _match(ranges, corrected, counter)
         base = se2_compose(theirs, np.broadcast_to(se2_inverse(T_base_sensor), theirs.shape))
         streams["reference"] = Trajectory(times[index], base)
-        says = f"{corrected.name}: another SLAM's output, matched by ranges; not surveyed"
+        reference = f"{corrected.name}: another SLAM's output, matched by ranges; not surveyed"
     return SensorLog(
         name=raw.name.split(".")[0],
         streams=streams,
@@ -150,7 +150,7 @@ def read_carmen(
         dropped=dict(counter.counts),
         meta={
             "source": raw.name,
-            "reference": says,
+            "reference": reference,
             "assumed": assumed,
             "odometry_sigmas": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()},
         },

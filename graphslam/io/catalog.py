@@ -162,8 +162,8 @@ def _read(
         return value
     if not r.takes_name():
         value = replace(value, **named)
-    said = {"name": name, "found": found, "options": {k: _plain(v) for k, v in options.items()}, "also": list(also)}
-    return replace(value, meta={**value.meta, "reader": said})
+    used = {"name": name, "found": found, "options": {k: _plain(v) for k, v in options.items()}, "also": list(also)}
+    return replace(value, meta={**value.meta, "reader": used})
 
 
 def _plain(value: Any) -> Any:

@@ -166,23 +166,23 @@ def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
     except OSError as error:
         raise MissingDataError(f"file cannot be read ({error.strerror})", where=str(p)) from None
     if head.startswith(b"ply"):
-        said = _ply_layout(head, str(p))
+        layout = _ply_layout(head, str(p))
     elif head[:4] == b"LASF":
         return _las_count(head, size, str(p))
     elif re.match(_PCD, head[:2000]):
-        said = _pcd_layout(head, str(p))
+        layout = _pcd_layout(head, str(p))
     elif file_ending(p) == ".bin":
         return _bin_count(size, str(p), columns)
     else:
         raise FormatError("no cloud of a known format", where=str(p), got=repr(head[:12]), wanted=_KNOWN)
-    if size < said.least_bytes():
+    if size < layout.least_bytes():
         raise FormatError(
             "file is truncated",
             where=str(p),
             got=f"{size} bytes",
-            wanted=f"{said.least_bytes()} for {said.count} points",
+            wanted=f"{layout.least_bytes()} for {layout.count} points",
         )
-    return said.count
+    return layout.count
 
 
 def _bin_count(size: int, where: str, columns: int) -> int:
@@ -280,12 +280,12 @@ def _ply_layout(head: bytes, where: str) -> _Layout:
 
 
 def _ply(raw: bytes, where: str) -> CloudData:
-    said = _ply_layout(raw[:_HEADER], where)
-    body = raw[said.begin :]
-    if said.dtype is None:
-        rows = body.splitlines()[said.skip : said.skip + said.count]
-        return columns_cloud(_ascii(rows, said.count, said.labels, where), where)
-    return columns_cloud(_records(body, said.count, said.dtype, where), where)
+    layout = _ply_layout(raw[:_HEADER], where)
+    body = raw[layout.begin :]
+    if layout.dtype is None:
+        rows = body.splitlines()[layout.skip : layout.skip + layout.count]
+        return columns_cloud(_ascii(rows, layout.count, layout.labels, where), where)
+    return columns_cloud(_records(body, layout.count, layout.dtype, where), where)
 
 
 def _ascii(rows: list[bytes], n: int, labels: list[str], where: str) -> dict[str, npt.NDArray[Any]]:
@@ -318,16 +318,16 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
     end = re.search(rb"\bDATA\s+(\w+)[ \t]*\r?\n", head[:_HEADER])
     if end is None:
         raise FormatError("PCD header has no end", where=where, wanted="DATA in the first 64 kB")
-    said: dict[str, list[str]] = {}
+    header: dict[str, list[str]] = {}
     for line in head[: end.start()].decode("latin-1").splitlines():
         words = line.split("#")[0].split()
         if words:
-            said[words[0].upper()] = words[1:]
+            header[words[0].upper()] = words[1:]
     try:
-        fields = said["FIELDS"] if "FIELDS" in said else said["COLUMNS"]
-        sizes, kinds = [int(s) for s in said["SIZE"]], said["TYPE"]
-        counts = [int(c) for c in said.get("COUNT", ["1"] * len(fields))]
-        n = int(said["POINTS"][0]) if "POINTS" in said else int(said["WIDTH"][0]) * int(said["HEIGHT"][0])
+        fields = header["FIELDS"] if "FIELDS" in header else header["COLUMNS"]
+        sizes, kinds = [int(s) for s in header["SIZE"]], header["TYPE"]
+        counts = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
+        n = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     except (KeyError, IndexError, ValueError) as error:
         raise FormatError(f"PCD header is damaged ({error})", where=where) from None
     codes = {"F": "f", "I": "i", "U": "u"}
@@ -337,7 +337,7 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
         for k, s, c in zip(kinds, sizes, counts)
     ):
         raise FormatError(
-            "PCD header is damaged", where=where, got={k: said.get(k) for k in ("FIELDS", "SIZE", "TYPE", "COUNT")}
+            "PCD header is damaged", where=where, got={k: header.get(k) for k in ("FIELDS", "SIZE", "TYPE", "COUNT")}
         )
     columns = [  # fields named "_" are padding: they may be repeated, and be of no size
         (f"{f}#{i}" if f == "_" else f, f"<{codes[k]}{s}", c)
@@ -356,20 +356,20 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
 
 
 def _pcd(raw: bytes, where: str) -> CloudData:
-    said = _pcd_layout(raw[:_HEADER], where)
-    body, n = raw[said.begin :], said.count
-    if said.dtype is None:
+    layout = _pcd_layout(raw[:_HEADER], where)
+    body, n = raw[layout.begin :], layout.count
+    if layout.dtype is None:
         rows = [r for r in body.splitlines() if r.strip()][:n]
-        return columns_cloud(_ascii(rows, n, said.labels, where), where)
-    if said.packed is None:
-        return columns_cloud(_records(body, n, said.dtype, where), where)
+        return columns_cloud(_ascii(rows, n, layout.labels, where), where)
+    if layout.packed is None:
+        return columns_cloud(_records(body, n, layout.dtype, where), where)
     packed, plain = (int(v) for v in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     check_size(plain, where)
-    if plain != n * said.dtype.itemsize or packed > len(body) - 8:
+    if plain != n * layout.dtype.itemsize or packed > len(body) - 8:
         raise FormatError("file is truncated", where=where, got=f"{len(body) - 8} bytes", wanted=f"{packed} packed")
     data = unpack_lzf(body[8 : 8 + packed], plain, where)
     out, at = {}, 0
-    for f, d, c in said.packed:  # stored by field, not by point
+    for f, d, c in layout.packed:  # stored by field, not by point
         size = np.dtype(d).itemsize * c * n
         if c == 1:
             out[f] = np.frombuffer(data, d, count=n, offset=at)

@@ -102,8 +102,8 @@ def separator_of(line: str) -> str | None:
 
 def header_of(line: str, number: int = 1) -> Header:
     """Columns identified by their names; columns with an unknown name or unit are ignored."""
-    said = line.lstrip("#% ").rstrip()
-    bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", said))  # "v [m/s]" and "v (m/s)" become "v[m/s]"
+    text = line.lstrip("#% ").rstrip()
+    bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", text))  # "v [m/s]" and "v (m/s)" become "v[m/s]"
     sep = separator_of(bare)
     words = [w.strip().strip('"').lower() for w in (bare.split(sep) if sep else bare.split())]
     columns: dict[str, tuple[int, float]] = {}
@@ -120,7 +120,7 @@ def header_of(line: str, number: int = 1) -> Header:
         if ours is None or ours in columns or (unit and factors and unit not in factors):
             continue
         columns[ours] = k, factors.get(unit, 1.0)
-    return Header(columns, sep, len(words), number, said[:120])
+    return Header(columns, sep, len(words), number, text[:120])
 
 
 def _header_in(lines: list[str]) -> Header | None:

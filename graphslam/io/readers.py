@@ -107,7 +107,7 @@ _ADVICE = {
 
 
 def _advice(look: SourceProbe) -> str:
-    said = next((text for end, text in _ADVICE.items() if end in look.by_ending), "")
-    if look.path.is_file() and not said and (first := look.lines(look.path, 1)):
-        said = f"first line {first[0][:60]!r}"
-    return f"; {said}" if said else ""
+    advice = next((text for end, text in _ADVICE.items() if end in look.by_ending), "")
+    if look.path.is_file() and not advice and (first := look.lines(look.path, 1)):
+        advice = f"first line {first[0][:60]!r}"
+    return f"; {advice}" if advice else ""

@@ -118,11 +118,11 @@ def _euroc(look: SourceProbe) -> ReaderMatch | None:
     found = euroc_tables(look)
     if not found:
         return None
-    said = "EuRoC: " + ", ".join(f"{k} ({look.relative(p)})" for k, p in found.items())
+    text = "EuRoC: " + ", ".join(f"{k} ({look.relative(p)})" for k, p in found.items())
     return (
-        ReaderMatch(said)
+        ReaderMatch(text)
         if "imu" in found and look.path.is_dir()
-        else ReaderMatch(said, "a folder with imu0's data.csv in it")
+        else ReaderMatch(text, "a folder with imu0's data.csv in it")
     )
 
 
@@ -140,8 +140,8 @@ def _bag(look: SourceProbe) -> ReaderMatch | None:
             return None
         what = "is empty" if empty[0].stat().st_size == 0 else "does not begin like one"
         return ReaderMatch(f"a bag by its name, {look.relative(empty[0])}, which {what}", "a bag that is whole")
-    said = f"{kinds[0][1]} {look.relative(kinds[0][0])}"
-    return ReaderMatch(said if len(kinds) == 1 else f"{said} and {len(kinds) - 1} more files")
+    text = f"{kinds[0][1]} {look.relative(kinds[0][0])}"
+    return ReaderMatch(text if len(kinds) == 1 else f"{text} and {len(kinds) - 1} more files")
 
 
 def _kitti(look: SourceProbe) -> ReaderMatch | None:
@@ -151,15 +151,15 @@ def _kitti(look: SourceProbe) -> ReaderMatch | None:
     if look.path.is_file() or not (clouds or oxts):
         return None
     folders = sorted({p.parent for p in clouds})
-    said = f"KITTI {'raw' if oxts or any(f.name == 'data' for f in folders) else 'odometry'}, {len(clouds)} clouds"
+    text = f"KITTI {'raw' if oxts or any(f.name == 'data' for f in folders) else 'odometry'}, {len(clouds)} clouds"
     if not clouds:
         return ReaderMatch(
             f"KITTI raw: {len(oxts)} records of oxts and no cloud", "velodyne_points/data/*.bin beside oxts"
         )
     if len(folders) > 1:
         names = ", ".join(look.relative(f) for f in folders[:4])
-        return ReaderMatch(f"{said} in {len(folders)} drives", f"one of them: {names}")
-    return ReaderMatch(said)
+        return ReaderMatch(f"{text} in {len(folders)} drives", f"one of them: {names}")
+    return ReaderMatch(text)
 
 
 def _carmen(look: SourceProbe) -> ReaderMatch | None:
@@ -196,12 +196,12 @@ def _clouds(look: SourceProbe) -> ReaderMatch | None:
     if not found:
         return None
     where = look.relative(found[0].parent) if look.path.is_dir() and found[0].parent != look.path else ""
-    said = f"{len(found)} cloud{'s' if len(found) > 1 else ''} ({e[1:].upper()}{f', in {where}' if where else ''})"
+    text = f"{len(found)} cloud{'s' if len(found) > 1 else ''} ({e[1:].upper()}{f', in {where}' if where else ''})"
     head = look.head(found[0])
     if e == ".ply" and b"element vertex" in head and re.search(rb"element face [1-9]", head) and len(found) == 1:
-        return ReaderMatch(f"{said}, a surface", "scans, one file each")
+        return ReaderMatch(f"{text}, a surface", "scans, one file each")
     if len(found) == 1:
-        return ReaderMatch(said, "a folder with one cloud a scan, in the order of their names: one cloud is no log")
+        return ReaderMatch(text, "a folder with one cloud a scan, in the order of their names: one cloud is no log")
     folders = Counter(p.parent for p in look.by_ending[e])
     alike = sorted(f for f, n in folders.items() if 2 * n >= len(found))
     if len(alike) > 1:
@@ -210,7 +210,7 @@ def _clouds(look: SourceProbe) -> ReaderMatch | None:
             f"folders of {e[1:].upper()} clouds: {len(alike)}", f"one of them, for they are no one log: {names}"
         )
     poses = pose_file(look)
-    return ReaderMatch(f"{said}, poses in {look.relative(poses)}" if poses else f"{said}, no poses")
+    return ReaderMatch(f"{text}, poses in {look.relative(poses)}" if poses else f"{text}, no poses")
 
 
 def pose_file(look: SourceProbe) -> Path | None:
@@ -228,9 +228,9 @@ def _network(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.texts if any(NETWORK.match(s) for s in look.lines(p, 50))]
     if not found:
         return None
-    said = f"a pose network, {look.relative(found[0])}"
+    text = f"a pose network, {look.relative(found[0])}"
     return (
-        ReaderMatch(said) if look.path.is_file() else ReaderMatch(said, f"the file itself: graphslam solve {found[0]}")
+        ReaderMatch(text) if look.path.is_file() else ReaderMatch(text, f"the file itself: graphslam solve {found[0]}")
     )
 
 

@@ -168,11 +168,11 @@ class SubmapEstimate:
 
     def _repr_html_(self) -> str:
         polished = "" if self.objective_polished is None else f", polished {self.objective_polished:.4f}"
-        said = (
+        summary = (
             f": {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
             f"objective {self.objective:.4f}{polished}, {self.iterations} iterations, {self.seconds:.3f} s"
         )
-        return join_parts([html_element("b", "Joined map"), said])
+        return join_parts([html_element("b", "Joined map"), summary])
 
 
 # Shortest fraction of a step before damping is used.

@@ -94,8 +94,8 @@ def choose_group(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outc
     score = own - other + MAJORITY * (len(outside) - len(inside))
     words = f"without either, χ² {own:.1f} of {len(inside)} in the graph, {other:.1f} of {len(outside)} outside"
     if abs(maps) > -math.log(ERROR):
-        said = f"dispute: the maps say so by a log-ratio of {abs(maps):.1f}; {words}"
-        return ("changes" if maps > 0 else "stays"), said
+        reason = f"dispute: the maps say so by a log-ratio of {abs(maps):.1f}; {words}"
+        return ("changes" if maps > 0 else "stays"), reason
     if len(outside) == 1:
         return "stays", f"dispute: {words}"
     if score > DOUBT:

@@ -76,9 +76,9 @@ def moving_points(submaps: Sequence[Submap], bases: Array) -> list[Mask]:
             if not isinstance(grid, EvidenceGrid):
                 continue
             T = np.asarray(se3.se3_between(bases[j], bases[k]))
-            says = known_state(grid, _world(T, cloud.points[asked]), FREE)
-            free += says < 0
-            supported += says > 0
+            state = known_state(grid, _world(T, cloud.points[asked]), FREE)
+            free += state < 0
+            supported += state > 0
         moved = np.zeros(len(cloud), np.bool_)
         moved[asked[(free >= LEAST_FREE) & (free > supported)]] = True
         out.append(_in_company(world, moved))

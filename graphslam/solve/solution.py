@@ -291,11 +291,11 @@ class Solution:
     def _repr_html_(self) -> str:
         verdict = "at the optimum" if self.converged else f"not at its optimum (may still fall by {self.decrement:.3g})"
         gap = "" if self.gap is None else f", gap {self.gap:.3g}"
-        said = (
+        summary = (
             f" ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
             f"{self.objective:.4f}, {verdict}{gap}, {self.iterations} iterations, {self.seconds:.2f} s"
         )
-        return join_parts([html_element("b", "Solution"), said, Markup(self.score._repr_html_())])
+        return join_parts([html_element("b", "Solution"), summary, Markup(self.score._repr_html_())])
 
 
 # Decrement of an optimum, relative to max(1, objective): below the precision of printed objectives, above rounding

@@ -355,11 +355,11 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
         if key in f:
             level = _level(f[key].value - 1.0, f[key].sigma, SCALE)
             if level:
-                said = f"{what} by scan matching: {f[key].value:.3g} ± {f[key].sigma:.2g} times those of the odometry"
-                out.append(Finding(level, f"{key}-disagrees", f"{said} — {causes(f[key].value)}."))
+                result = f"{what} by scan matching: {f[key].value:.3g} ± {f[key].sigma:.2g} times those of the odometry"
+                out.append(Finding(level, f"{key}-disagrees", f"{result} — {causes(f[key].value)}."))
         elif found.matched >= LEAST_PAIRS and scans > 0.1 and scans > 5.0 * odometry:
-            said = f"motion between two scans: {scans:.2g} {unit} by scan matching, {odometry:.2g} by the odometry"
-            out.append(Finding("bad", f"{key}-disagrees", f"{said} — the odometry seems to stand still."))
+            result = f"motion between two scans: {scans:.2g} {unit} by scan matching, {odometry:.2g} by the odometry"
+            out.append(Finding("bad", f"{key}-disagrees", f"{result} — the odometry seems to stand still."))
     if ("distance" in f and abs(f["distance"].value - 1.0) > 0.5) or ("turn" in f and abs(f["turn"].value - 1.0) > 0.5):
         return out  # angles and levers are meaningless with such errors
     mounted: list[str] = []

@@ -270,10 +270,10 @@ _NO_MEMORY = (
 def lacks_memory(error: BaseException | None) -> bool:
     """Whether the system refused memory: an import, a thread or a library says so in its own words."""
     while error is not None:
-        said = str(error).lower()
+        message = str(error).lower()
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
             return True
-        if any(words in said for words in _NO_MEMORY):
+        if any(words in message for words in _NO_MEMORY):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -283,17 +283,17 @@ def error_line(error: BaseException) -> str:
     """Message of an error: our own unchanged, system errors with advice."""
     if isinstance(error, (KeyboardInterrupt, Interrupted)):
         return f"{str(error) or 'interrupted'}; {_go_on(sys.argv[1:])}"
-    said = printable(" ".join(str(error).split()))
+    message = printable(" ".join(str(error).split()))
     if isinstance(error, GraphSlamError):
-        return said
+        return message
     if lacks_memory(error):  # NumPy's message has the requested size
-        return f"not enough memory; use a smaller part of the data, or a machine with more memory. {said}".strip()
+        return f"not enough memory; use a smaller part of the data, or a machine with more memory. {message}".strip()
     if isinstance(error, RecursionError):
         return "an input file is nested too deeply; check the input files for a damaged one"
     if isinstance(error, OSError):
         files = [str(f) for f in (error.filename, error.filename2) if f is not None]
         return printable(f"{': '.join([*files, error.strerror or str(error)])}{_advice(error.errno)}")
-    return said
+    return message
 
 
 def _advice(number: int | None) -> str:

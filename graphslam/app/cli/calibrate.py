@@ -58,5 +58,5 @@ def calibrate_command(
             with atomic_open(out, "w") as file:
                 file.write(dump_toml({"calibrate": found.config()}))
 
-    said = "" if out is None else f"written to {out}: graphslam run {source} --config {out}"
-    write_and_print(write, value, text, said, as_json=as_json)
+    note = "" if out is None else f"written to {out}: graphslam run {source} --config {out}"
+    write_and_print(write, value, text, note, as_json=as_json)

@@ -82,9 +82,9 @@ def join_command(
     plain = isinstance(material, Sequence)
     found = join_verdict(value["methods"][0], estimate)
     length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
-    said = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)
-    value |= {"headline": said.text, "verdict": [f.as_row() for f in found]}
-    text = "\n".join([text_table(value["methods"], JSON_COLUMNS), *verdict_text(said, found)])
+    headline = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)
+    value |= {"headline": headline.text, "verdict": [f.as_row() for f in found]}
+    text = "\n".join([text_table(value["methods"], JSON_COLUMNS), *verdict_text(headline, found)])
     if out is None:
         return print_result(value, text, as_json=as_json)
 
@@ -137,9 +137,9 @@ def compare_command(
         **options,
     )
     value: dict[str, Any] = comparing.methods_json(found)
-    said = compare_verdict(value["methods"])
-    value["verdict"] = [f.as_row() for f in said]
-    text = [text_table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
+    findings = compare_verdict(value["methods"])
+    value["verdict"] = [f.as_row() for f in findings]
+    text = [text_table(comparing.comparison_rows(value["methods"])), *(f.text for f in findings)]
     if s.truth is None:
         text.append("NEES and CI: not tested — these submaps have no ground truth.")
     elif n := found["nees_dof"].iloc[0]:

@@ -93,9 +93,9 @@ def map_command(
     rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
     text = text_table(rows)
     if made.clearest is not None:
-        chosen, said = _clearest(made.clearest)
+        chosen, line = _clearest(made.clearest)
         value |= chosen
-        text += f"{said}\npaths and graphs of all candidates: {run / 'alternatives'}"
+        text += f"{line}\npaths and graphs of all candidates: {run / 'alternatives'}"
         if made.clearest.left_out:
             text += f"\n{made.clearest.left_out} more candidates were not solved"
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}

@@ -48,8 +48,8 @@ def loops_command(
     counts = ledger.counts()
     shown = rows if every or as_json else [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = len(rows) - len(shown)
-    said = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counts.items())) or "none"
-    text = f"{text_table(shown, SHOWN)}\nloops: {said}"
+    summary = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counts.items())) or "none"
+    text = f"{text_table(shown, SHOWN)}\nloops: {summary}"
     if hidden:
         text += f"; {hidden} refused by their registration are not shown (--all)"
     print_result({"run": str(run), "counts": counts, "loops": rows}, text, as_json=as_json)

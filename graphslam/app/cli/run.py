@@ -197,14 +197,14 @@ def join_note(result: Any) -> list[str]:
     chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
     if chi2 is None or not dof > 0:
         return []
-    low, high, said = two_sided_bounds(chi2, dof, CERTAIN)
-    if said == "consistent":
+    low, high, verdict = two_sided_bounds(chi2, dof, CERTAIN)
+    if verdict == "consistent":
         return []
     text = (
         f"note: χ²/dof of the join: {chi2:.3g} [{low:.3g}, {high:.3g} in 999 of 1000 consistent runs; {dof:.4g} dof]. "
     )
     causes = [f.code for f in result.verdict if f.code in CAUSES and f.level in ("look", "bad")]
-    if said == "overconfident" and causes:
+    if verdict == "overconfident" and causes:
         named = ", ".join(f"“{c}”" for c in dict.fromkeys(causes))
         return [f"{text}The verdict names a cause ({named}): correct it before you scale covariances"]
     scale = result.report["covariance_scale"] * chi2

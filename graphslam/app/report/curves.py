@@ -82,7 +82,7 @@ class _Axis:
     def panel(
         self,
         name: str,
-        said: str,
+        text: str,
         values: Array,
         *,
         unit: str = "",
@@ -93,7 +93,7 @@ class _Axis:
         keep = extreme_rows(values, MOST)
         cut = np.flatnonzero(np.diff(self.piece[keep]) > 0) + 1
         out: dict[str, Any] = {
-            **{"name": name, "said": said, "unit": unit, "kind": self.kind, "colour": style.ESTIMATE},
+            **{"name": name, "said": text, "unit": unit, "kind": self.kind, "colour": style.ESTIMATE},
             **{"log": bounds is not None, "expected": expected, "cut": cut.tolist()},
             **{"t": base64_floats(self.t[keep]), "s": base64_floats(self.s[keep])},
             **{"xyz": packed_points(self.xyz[keep]), "value": base64_floats(values[keep])},
@@ -127,30 +127,30 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
             return []
         made = path_consistency(m.trajectory, read_tum(file, dim=m.dim), chart=chart_of(folder))
     except GraphSlamError as error:
-        said = " ".join(str(error).replace(f"{folder.path}/", "").split())
-        folder.problems.setdefault("truth.tum", f"no NEES curve: {said}")
+        text = " ".join(str(error).replace(f"{folder.path}/", "").split())
+        folder.problems.setdefault("truth.tum", f"no NEES curve: {text}")
         return []
     if len(made.rows) < 2:
         return []
     axis, ratio = _Axis.of(m.trajectory, made.rows), made.nees / made.dof
     low, high, _ = two_sided_bounds(1.0, made.dof, CONFIDENCE)
     inside = float(np.mean((ratio >= low) & (ratio <= high)))
-    said = (
+    text = (
         f"NEES of every pose (ground truth, first base fixed); {_BOUNDS} bounds of one pose with {made.dof} degrees of "
         f"freedom [{low:.3g}, {high:.3g}]; {_percent(inside)} of {len(ratio)} poses are inside. Errors of neighbours "
         "are correlated."
     )
     if made.certain:
-        said += f" Not shown: {made.certain} poses with a singular covariance, such as the first base."
-    panels = [axis.panel("NEES/dof of the path", said, ratio, expected=1.0, bounds=(low, high))]
+        text += f" Not shown: {made.certain} poses with a singular covariance, such as the first base."
+    panels = [axis.panel("NEES/dof of the path", text, ratio, expected=1.0, bounds=(low, high))]
     for k, name in enumerate(made.names):
         turn = name == "heading"
         scale = np.rad2deg(1.0) if turn else 1.0
         errors, sigmas = scale * made.errors[:, k], scale * made.sigmas[:, k]
         out = float(np.mean(np.abs(errors) > SIGMAS * sigmas))
-        said = f"Ground truth minus estimate, ± {SIGMAS:g} σ; {_percent(out)} outside (consistent: 5 %)."
+        text = f"Ground truth minus estimate, ± {SIGMAS:g} σ; {_percent(out)} outside (consistent: 5 %)."
         panels.append(
-            axis.panel(f"Error of {name}", said, errors, unit="°" if turn else "m", expected=0.0, sigmas=sigmas)
+            axis.panel(f"Error of {name}", text, errors, unit="°" if turn else "m", expected=0.0, sigmas=sigmas)
         )
     return panels
 
@@ -168,26 +168,26 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
         d, axis = v.shape[1], _Axis.at(path, times)
         low, high, _ = two_sided_bounds(1.0, d, CONFIDENCE)
         inside = float(np.mean((nis / d >= low) & (nis / d <= high)))
-        said = (
+        note = (
             f"Withheld GPS fixes against their prediction by the graph; {_BOUNDS} bounds of one fix "
             f"[{low:.3g}, {high:.3g}]; {_percent(inside)} of {len(nis)} are inside."
         )
         if folder.part("refine"):
-            said += " The prediction is that of the graph before refinement."
+            note += " The prediction is that of the graph before refinement."
         name = "NIS/dof of withheld GPS"
-        out = [axis.panel(name, said, nis / d, expected=1.0, bounds=(low, high))]
+        out = [axis.panel(name, note, nis / d, expected=1.0, bounds=(low, high))]
         for k, of in enumerate("xyz"[:d]):
-            said = f"Fix minus prediction, {of} of the GPS frame, ± {SIGMAS:g} σ of both."
+            note = f"Fix minus prediction, {of} of the GPS frame, ± {SIGMAS:g} σ of both."
             name, half = f"Withheld GPS, {of}", sigma[:, k]
-            out.append(axis.panel(name, said, v[:, k], unit="m", expected=0.0, sigmas=half))
+            out.append(axis.panel(name, note, v[:, k], unit="m", expected=0.0, sigmas=half))
         return out
-    for name, said in (("withheld", "withheld from the graph"), ("all", "as in the metrics")):
+    for name, note in (("withheld", "withheld from the graph"), ("all", "as in the metrics")):
         try:
             scored = read_gps_residuals(folder.path / f"gps_{name}.npz")
         except GraphSlamError:
             continue
         if len(scored.times):
-            text = f"Distance of fixes to the antenna on the path; {said}. No bounds available."
+            text = f"Distance of fixes to the antenna on the path; {note}. No bounds available."
             return [_Axis.at(path, scored.times).panel("Distance to GPS", text, scored.errors, unit="m")]
     return []
 
@@ -214,8 +214,8 @@ def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
     ]
     if not rows:
         return []
-    said = f"At the optimum, with {_BOUNDS} bounds. Above them the assumed noise is too small, below them too large."
-    return [{"name": "χ²/dof by class of factor", "said": said, "unit": "", "kind": "rows", "log": True, "rows": rows}]
+    text = f"At the optimum, with {_BOUNDS} bounds. Above them the assumed noise is too small, below them too large."
+    return [{"name": "χ²/dof by class of factor", "said": text, "unit": "", "kind": "rows", "log": True, "rows": rows}]
 
 
 def _six(value: float) -> float:

@@ -57,10 +57,10 @@ def report_pictures(folder: ReportFolder) -> Markup:
     elif "map.png" not in made:
         parts.append(missing_note("the map (figures/map.png)."))
     if folder.kind == "run" and not any(n.startswith("fused") for n in made):
-        said = folder.report.get(
+        reason = folder.report.get(
             "map_left_out", "the submaps have no evidence grids or clouds, or no map was requested."
         )
-        parts.append(missing_note("a fused map: ", said))
+        parts.append(missing_note("a fused map: ", reason))
     return page_section("figures", "Figures", *parts)
 
 

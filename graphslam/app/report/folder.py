@@ -78,8 +78,8 @@ class ReportFolder:
         """Source of the run, or names of the merged sessions."""
         if self.kind == "merged":
             return " + ".join(str(s.get("name", "?")) for s in self.sessions) or "merged runs"
-        said = self.config.get("run", {})
-        return str(self.report.get("source", said.get("source", "unknown") if isinstance(said, dict) else "unknown"))
+        run = self.config.get("run", {})
+        return str(self.report.get("source", run.get("source", "unknown") if isinstance(run, dict) else "unknown"))
 
     @property
     def sessions(self) -> list[dict[str, Any]]:

@@ -31,13 +31,13 @@ def loops_section(folder: ReportFolder) -> Markup:
     if not folder.loop_rows:
         return page_section("loops", title, _none(folder), *_ties(folder))
     counts = folder.loops.counts()
-    said = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
+    summary = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
     rows = sorted(folder.loop_rows, key=_rank)
     # candidates that the registration rejected are the most frequent and the least interesting
     short = [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = [r for r in rows if str(r["why"]).startswith("registration")]
     parts: list[Any] = [
-        remark(f"Loop closures: {len(rows)}; {said}. `graphslam loops` lists them; --undo removes one.")
+        remark(f"Loop closures: {len(rows)}; {summary}. `graphslam loops` lists them; --undo removes one.")
     ]
     parts.append(_ledger(short) if short else remark("Only those below."))
     if hidden:
@@ -101,8 +101,8 @@ def _ties(folder: ReportFolder) -> list[Markup]:
         found = s.get("candidates")
         for c in found if isinstance(found, list) else []:
             if isinstance(c, Mapping):
-                said = "accepted" if c.get("accepted") else "rejected"
-                rows.append(Row({**c, "session": s.get("name"), "verdict": said}, said))
+                verdict = "accepted" if c.get("accepted") else "rejected"
+                rows.append(Row({**c, "session": s.get("name"), "verdict": verdict}, verdict))
     if not rows:
         return [
             html_element("h3", "Loop closures between sessions"),

@@ -84,11 +84,11 @@ def make_report(folder: str | Path) -> Report:
 
 def _page(home: Path, root: Path) -> Report:
     found = read_folder(home, root)
-    said, lines = verdict_lines(found)
+    headline, lines = verdict_lines(found)
     shown = report_scene(found)
     html = whole_page(
         title=plain_text(f"{_TITLES[found.kind]}: {found.name}"),
-        headline=said,
+        headline=headline,
         findings=[replace(f, text=plain_text(f.text)) for f in lines],
         scene=shown,
         parts={name: made for name, part in _PARTS.items() if (made := part(found))},

@@ -40,7 +40,7 @@ _UNFINISHED = "the run is not finished."
 
 def what_was_run(folder: ReportFolder) -> Markup:
     """Names, seed, versions, and every option with its value."""
-    r, said = folder.report, folder.config.get("run", {})
+    r, options = folder.report, folder.config.get("run", {})
     parts: list[Any] = []
     if folder.kind == "merged":
         facts = {"merged by": r.get("by"), "solver": r.get("solver")}
@@ -57,9 +57,9 @@ def what_was_run(folder: ReportFolder) -> Markup:
         ]
         parts.append(remark("Options and versions are in the reports of the single runs."))
         return page_section("run", "What was run", *parts)
-    said = said if isinstance(said, dict) else {}
+    options = options if isinstance(options, dict) else {}
     names = ("source", "frontend", "solver", "seed")
-    parts.append(pair_list({k: r.get(k, said.get(k)) for k in names}))
+    parts.append(pair_list({k: r.get(k, options.get(k)) for k in names}))
     if folder.kind == "interrupted":
         parts.append(remark(stopping_line(folder)))
     versions = folder.part("versions")
@@ -79,8 +79,8 @@ def records_section(folder: ReportFolder) -> Markup:
         return page_section("records", "Records", remark("A merge reads submaps, not records."))
     title = "Records read, dropped, flagged"
     if not folder.report:
-        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "run.json")
-        return page_section("records", title, missing_note("counts of records; ", said))
+        why = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "run.json")
+        return page_section("records", title, missing_note("counts of records; ", why))
     read, dropped = folder.part("records_read"), folder.part("records_dropped")
     flagged = {k: v for k, v in folder.part("flagged_submaps").items() if k != "any"}
     parts: list[Any] = [html_element("h3", "Read")]
@@ -106,8 +106,8 @@ def metrics_section(folder: ReportFolder) -> Markup:
     """Every metric except times, with its unit, the better direction, and bounds if there are any."""
     rows = [r for r in folder.metrics if not is_time(r.get("key")) and r.get("key") != RESUMED]
     if not rows:
-        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
-        return page_section("metrics", "Metrics", missing_note("metrics; ", said))
+        why = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
+        return page_section("metrics", "Metrics", missing_note("metrics; ", why))
     bounds, folded_in = _bounds(folder.values())
     out = []
     for r in rows:
@@ -138,8 +138,8 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
         if owner is None:
             continue
         low, high, value = m[key], m[f"{stem}_high"], m[owner]
-        said = "overconfident" if value > high else "conservative" if value < low else "consistent"
-        out[owner] = (f"{low:.3g} to {high:.3g}", said)
+        result = "overconfident" if value > high else "conservative" if value < low else "consistent"
+        out[owner] = (f"{low:.3g} to {high:.3g}", result)
         folded_in |= {key, f"{stem}_high"}
     for key in m:
         stem = key.removesuffix("_per_dof")
@@ -181,8 +181,8 @@ def times_section(folder: ReportFolder) -> Markup:
     seconds = seconds or folder.part("seconds")
     rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
-        said = _UNFINISHED if folder.kind == "interrupted" else "not in the folder."
-        return page_section("times", "Times", missing_note("seconds of the stages; ", said))
+        why = _UNFINISHED if folder.kind == "interrupted" else "not in the folder."
+        return page_section("times", "Times", missing_note("seconds of the stages; ", why))
     parts: list[Any] = [html_table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
     if rows:
         parts.append(html_table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
@@ -261,8 +261,8 @@ def evidence_section(folder: ReportFolder) -> Markup:
 def _exceptions(t: pd.DataFrame) -> Markup:
     shared = t[t["kind"] != EXCLUSIVE]
     rows = []
-    for (kind, said), of in shared.groupby(["kind", "note"], sort=True):
-        rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": said})
+    for (kind, note), of in shared.groupby(["kind", "note"], sort=True):
+        rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": note})
     return html_table(rows, {"kind": "kind", "factors": "factors", "note": "reason"}) if rows else remark("None.")
 
 
@@ -281,8 +281,8 @@ def _kind_of_factor(label: str) -> str:
 def events_section(folder: ReportFolder) -> Markup:
     """Other decisions and dropped data, one line per event; routine events only as counts."""
     if folder.events is None:
-        said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "events.jsonl")
-        return page_section("events", "Events", missing_note("events; ", said))
+        why = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "events.jsonl")
+        return page_section("events", "Events", missing_note("events; ", why))
     counts = Counter(str(e.get("event", "?")) for e in folder.events)
     rows = [{"event": k, "times": n} for k, n in sorted(counts.items())]
     lines = [_line(e) for e in folder.events if str(e.get("event")) not in ROUTINE]

@@ -50,23 +50,23 @@ def apply_calibration(
     if isinstance(front, MixedFrontEnd):
         front = front.calibrated_part
         options = {"frontend": options.get("frontend", {}).get(front.name, {})}
-    said, found = [], None
+    lines, found = [], None
     if config.given is not None:  # values given by the user have priority over an estimate
         config = replace(config, given=keep_user_settings(config.given, options))
-        said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
+        lines = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
     elif config.use == "auto" and own and front.calibrates:
-        said = [Finding("", "calibrated", OWN)]
+        lines = [Finding("", "calibrated", OWN)]
     elif config.use != "none" and front.calibrates:
         effort = replace(QUICK, poses=max(int(QUICK.poses * config.budget), 100))
         try:
             found = calibrate_for_front_end(log, front, effort, seed=seed)
-            config, said = replace(config, given=keep_user_settings(found.corrections, options)), found.findings()
+            config, lines = replace(config, given=keep_user_settings(found.corrections, options)), found.findings()
         except GraphSlamError as error:
-            said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
+            lines = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
     if config.given is None:
-        return log, config, said, found
+        return log, config, lines, found
     corrected = apply_corrections(log, config.given)
-    return corrected, config, [*said, *_path_moved(log, corrected, config.given, front)], found
+    return corrected, config, [*lines, *_path_moved(log, corrected, config.given, front)], found
 
 
 def _path_moved(log: SensorLog, corrected: SensorLog, c: Corrections, front: FrontEnd) -> list[Finding]:
@@ -214,9 +214,9 @@ def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
     if not facts:
         return []
-    said = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
+    estimates = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
     rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
-    text = f"systematic errors estimated with the map: {'; '.join(said) or 'none significant'}"
+    text = f"systematic errors estimated with the map: {'; '.join(estimates) or 'none significant'}"
     text += f" — not significant: {', '.join(rest)}." if rest else "."
     text += " The covariances include their uncertainty."
     out = [Finding("", "biases", text)]

@@ -149,8 +149,8 @@ class RunFolder:
         file = resolve_inside(self.path, DRAWS, str(self.path))
         if not file.exists():
             return None
-        said = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})
-        return SeedChoice(said["draw"], said["attempts"])
+        stored = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})
+        return SeedChoice(stored["draw"], stored["attempts"])
 
     def settle(self, draw: int, attempts: list[dict[str, Any]]) -> None:
         """Keep the submaps of one draw as those of the run, and delete the others.

@@ -166,7 +166,7 @@ class RunOptions:
         """The log with corrections, the options for it, and the findings."""
         assert self.front is not None
         asked = self.asked or {}
-        log, applied, said, found = apply_calibration(
+        log, applied, findings, found = apply_calibration(
             log, self.front, self.settings.calibrate, asked, own=self.own, seed=self.named["seed"]
         )
         front = self.front.with_calibration(
@@ -176,7 +176,7 @@ class RunOptions:
             drift=found is not None and found.kind == "clouds" and found.corrections.along_metre is not None,
         )
         options = replace(self, settings=replace(self.settings, calibrate=applied), front=front)
-        return log, options, [StreamFinding("", f) for f in said]
+        return log, options, [StreamFinding("", f) for f in findings]
 
     def as_config(self) -> dict[str, Any]:
         """Content of ``config.toml``: names, seed, and every option with its value."""

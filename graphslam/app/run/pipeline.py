@@ -93,13 +93,13 @@ def run(
         if out is not None:
             options = options.with_digest(log)
         tell_stage(watch, "calibration")
-        log, options, said = options.calibrated(log)
+        log, options, findings = options.calibrated(log)
         clock.lap("calibrate")
         with RunFolder.start(out, options.as_config(), resume=resume) as folder:
             undone = [] if folder is None or not resume else folder.removed_loops()
             tell_stage(watch, "front end")
             slam = SubmapSlam(options, RecordSource(log), watch, folder)
-            result = finish_run(log, slam, clock, [*seen, *said], undone)
+            result = finish_run(log, slam, clock, [*seen, *findings], undone)
             tell_stage(watch, "figures")
             return result if folder is None else write_outputs(folder.path, result)
 

@@ -254,13 +254,13 @@ class Run:
 
     def _repr_html_(self) -> str:
         where = f" in {self.folder.name}" if self.folder else ""
-        said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
+        summary = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
         weighty = Findings(f for f in self.verdict if f.level in ("look", "bad"))
         figures = html_frame(self.metrics[["key", "value", "unit"]])
         return join_parts(
             [
                 html_element("p", html_element("b", self.headline.text)),
-                html_element("p", html_element("b", f"Run of {self.name}"), said),
+                html_element("p", html_element("b", f"Run of {self.name}"), summary),
                 weighty._repr_html_(),
                 self._picture(),
                 html_element("details", html_element("summary", f"{len(self.metrics)} figures"), figures),

@@ -108,8 +108,8 @@ def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
     for k, stream in enumerate(log.streams.values()):
         if not _is_kept(stream):
             arrays[f"times_{k}"] = stream.times
-    said = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in taken.noticed]
-    arrays["noticed"] = np.array(said, "U").reshape(-1, 4)
+    rows = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in taken.noticed]
+    arrays["noticed"] = np.array(rows, "U").reshape(-1, 4)
     if taken.identities is not None:
         arrays["identities"] = taken.identities
     write_npz(folder / "taken.npz", arrays)

@@ -49,28 +49,28 @@ def load(source: str | Path | SensorLog, *, reader: str | None = None, **options
     return log
 
 
-def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = None) -> SensorLog:
+def log_of_run(settings: Mapping[str, Any], log: str | Path | SensorLog | None = None) -> SensorLog:
     """Read the log of a run once more.
 
     Parameters
     ----------
-    said : mapping
+    settings : mapping
         Table ``run`` of the run's ``config.toml``: ``source`` as given by the user, and the digest ``log``.
     log : str, path or SensorLog, optional
         Where the log is now. Default: its original location; a relative path starts at the working directory.
     """
     try:
-        source = load(said["source"] if log is None else log)
+        source = load(settings["source"] if log is None else log)
     except GraphSlamError as error:
-        if log is not None or Path(said["source"]).exists():
+        if log is not None or Path(settings["source"]).exists():
             raise
         raise MissingDataError(
             "the log of the run cannot be read from this folder",
-            where=said["source"],
+            where=settings["source"],
             got="no data set or path of this name",
             wanted="the folder in which the run was started, or where the log is now (--log, log=…)",
         ) from error
     digest = log_digest(source)
-    if said.get("log", digest) != digest:
-        raise DataError("this is not the log of the run", where=source.name, got=digest, wanted=said["log"])
+    if settings.get("log", digest) != digest:
+        raise DataError("this is not the log of the run", where=source.name, got=digest, wanted=settings["log"])
     return source

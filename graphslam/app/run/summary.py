@@ -240,13 +240,13 @@ def headline(
         start += f" (power {min(power, 0.99):.0%} against covariances half as large as they should be)"
     if points:
         start += f"; {points} {'point' if points == 1 else 'points'} marked “{worst}”"
-    said = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in tests])
+    summary = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in tests])
     over = {j.code for j in tests if j.verdict == "overconfident"} | (
         {"trust"} if verdict == "overconfident" else set()
     )
     do = _advice(found, over, known, verdict)
     level: Level = "" if worst == "good" and verdict == "not tested" else worst
-    return Finding(level, "headline", f"{start}{' — ' + said if said else ''}. To do: {do}.")
+    return Finding(level, "headline", f"{start}{' — ' + summary if summary else ''}. To do: {do}.")
 
 
 def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:

@@ -150,8 +150,8 @@ def scans_of_run(run: Run, log: str | Path | SensorLog | None, *, what: str) -> 
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
     if run.map.dim != 3:
         raise DataError(f"{what} is read along a path in space", got="a run in the plane", wanted="a run in space")
-    said = read_options(run.folder)["run"]
-    source = log_of_run(said, log)
+    settings = read_options(run.folder)["run"]
+    source = log_of_run(settings, log)
     name = source.of_type(PointClouds) or source.of_type(RangeScans)
     scans = source.streams.get(name) if name else None
     if name is None or not isinstance(scans, PointClouds | RangeScans):

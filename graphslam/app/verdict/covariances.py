@@ -56,15 +56,15 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
     found = covariance_assessment(figures)
     if found is None:
         return []
-    said = "; ".join(_test_text(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
+    tests = "; ".join(_test_text(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
     rest = "Tested with residuals and withheld data, without ground truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
         rest += "; correct data association is assumed"
     if found.verdict == "overconfident":
-        text = f"covariances: overconfident — above the bounds: {said}. {rest}."
+        text = f"covariances: overconfident — above the bounds: {tests}. {rest}."
         return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
     if found.verdict == "not tested":
-        held = f" Available tests: {said}." if said else ""
+        held = f" Available tests: {tests}." if tests else ""
         causes = []
         if found.missing:
             errors = " and ".join(found.missing)
@@ -81,10 +81,10 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
             text += " Add loop closures, GPS or control points."
         return [Finding("", "trust", text)]
     if found.verdict == "conservative":
-        text = f"covariances: conservative — below the bounds: {said}; residuals are not time-correlated. {rest}."
+        text = f"covariances: conservative — below the bounds: {tests}; residuals are not time-correlated. {rest}."
         return [Finding("look", "trust", text)]
     power = f"power {min(found.power, 0.99):.0%} against covariances half as large as they should be"
-    text = f"covariances: consistent [{power}] — {said}. {rest}."
+    text = f"covariances: consistent [{power}] — {tests}. {rest}."
     return [Finding("good", "trust", text)]
 
 
@@ -97,9 +97,9 @@ def _test_text(row: ConsistencyTest) -> str:
 
 def check_nees(figures: RunMetrics) -> list[Finding]:
     """Do the errors relative to ground truth match the covariances?"""
-    said = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in nees_tests(figures)]
+    lines = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in nees_tests(figures)]
     none = "NEES: not tested — no ground truth for this result."
-    return [Finding(j.level, "nees", text) for j, text in said] or [Finding("", "nees", none)]
+    return [Finding(j.level, "nees", text) for j, text in lines] or [Finding("", "nees", none)]
 
 
 def check_classes(figures: RunMetrics) -> list[Finding]:

@@ -83,10 +83,10 @@ def _shares(submaps: Sequence[Submap]) -> list[Finding]:
 
 def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
     """Findings of front ends on submaps; of equal ones, the first two in full and the keys of the others."""
-    said = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
+    findings = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
     told: dict[tuple[Level, str], list[int]] = {}
     out = []
-    for key, f in said:
+    for key, f in findings:
         keys = told.setdefault((f.level, f.code), [])
         if key not in keys:
             keys.append(key)

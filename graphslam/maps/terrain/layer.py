@@ -65,11 +65,11 @@ def piece_of(rows: Rows, tables: TerrainWeights, pose: Array) -> TerrainPiece:
     n = int(offsets[-1])
     ratios, counts, heights = np.zeros((2, n), np.int32), np.zeros((4, n), np.int32), np.zeros((3, n), np.int64)
     add_rows(rows, first, shapes, offsets, tables.ratios, ratios, counts, heights)
-    said = np.flatnonzero(counts.any(axis=0))  # ground detections always have a support detection, too
-    band = np.searchsorted(offsets, said, side="right") - 1
-    iy, ix = np.divmod(said - offsets[band], shapes[band, 1])
+    filled = np.flatnonzero(counts.any(axis=0))  # ground detections always have a support detection, too
+    band = np.searchsorted(offsets, filled, side="right") - 1
+    iy, ix = np.divmod(filled - offsets[band], shapes[band, 1])
     cells = np.column_stack([band, ix + first[band, 0], iy + first[band, 1]])
-    ratios, counts, heights = ratios[:, said], counts[:, said], heights[:, said]
+    ratios, counts, heights = ratios[:, filled], counts[:, filled], heights[:, filled]
     return TerrainPiece(cells, ratios, counts, heights, np.asarray(pose, dtype=np.float64))
 
 

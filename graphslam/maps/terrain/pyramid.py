@@ -240,10 +240,10 @@ class Pyramid:
         for b in range(self.bands):
             counts = self._fine(self.counts, b)
             ratios = self._fine(self.ratios, b) / SCALE
-            says = np.stack([counts[STEP] > 0, counts[SUPPORT] > 0])
+            observed = np.stack([counts[STEP] > 0, counts[SUPPORT] > 0])
             factors = hazard_factors(ratios, counts[: OVERHANG + 1], self.weights_of(b))
             for channel in (STEP, SUPPORT):
-                fresh = says[channel] & ~known[channel]
+                fresh = observed[channel] & ~known[channel]
                 free[channel][fresh] = factors[channel][fresh]
                 known[channel] |= fresh
                 (band if channel == STEP else support_band)[fresh] = b

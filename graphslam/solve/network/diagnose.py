@@ -51,8 +51,8 @@ def check_full_rank(network: PoseNetwork, flat: FactorArrays, values: Values) ->
 
 def _in_words(network: PoseNetwork, names: Sequence[str]) -> tuple[str, ...]:
     """Names of variables as in the file, in its order."""
-    said = sorted((kind.word == "l", k) for kind, k in map(split_name, names))
-    return tuple(f"landmark {k}" if mark else f"vertex {network.ids[k]}" for mark, k in said)
+    parts = sorted((kind.word == "l", k) for kind, k in map(split_name, names))
+    return tuple(f"landmark {k}" if mark else f"vertex {network.ids[k]}" for mark, k in parts)
 
 
 def _list(names: tuple[str, ...]) -> str:

@@ -180,17 +180,17 @@ def _speed(log: SensorLog) -> float:
 def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str, seed: int) -> Iterator[Measurement]:
     """Errors of the map of a log and of its odometry, and whether the verdict reports a better input."""
     result = run(log, frontend=frontend, solver="batch", config=options, seed=seed, progress=False)
-    said = {f.code for f in findings_of_json(result.report["verdict"])}
+    codes = {f.code for f in findings_of_json(result.report["verdict"])}
     path = result.map.trajectory
     input_path = chain_odometry(next(s for s in log.streams.values() if isinstance(s, Odometry)))
     of_run, of_input = (path_errors(p, log["reference"]) for p in (path, input_path))
     for key, value in of_run.items():
         yield Measurement(name, key, value)
         yield Measurement(name, f"{key}_input", of_input[key])
-    yield Measurement(name, "input_told", float("input-better" in said))
-    yield Measurement(name, "calibration_refused", float("calibration-refused" in said))
+    yield Measurement(name, "input_told", float("input-better" in codes))
+    yield Measurement(name, "calibration_refused", float("calibration-refused" in codes))
     yield Measurement(
-        name, "worse_untold", float(of_run["path"] > 1.1 * of_input["path"] and "input-better" not in said)
+        name, "worse_untold", float(of_run["path"] > 1.1 * of_input["path"] and "input-better" not in codes)
     )
 
 

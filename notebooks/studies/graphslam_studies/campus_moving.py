@@ -55,9 +55,9 @@ def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> 
     occupied = np.asarray(grid.occupied_cloud())
     free, stopped = np.zeros(len(occupied), np.int64), np.zeros(len(occupied), np.int64)
     for moment in moments:
-        says = known_state(moment, occupied, 0.5 * FREE)
-        free += says < 0
-        rows = np.flatnonzero(says > 0)
+        state = known_state(moment, occupied, 0.5 * FREE)
+        free += state < 0
+        rows = np.flatnonzero(state > 0)
         stopped[rows[moment.occupied_at(occupied[rows])]] += 1
     return occupied, (free >= LEAST_FREE) & (free > stopped) & ~near_ground(occupied, occupied)
 

@@ -72,13 +72,13 @@ class AxesCheck:
         """Reading of each wrong axis: ``"x reads −y, y reads x"``; empty if all are as stated."""
         if not self.wrong:
             return ""
-        said = []
+        readings = []
         for row in range(3):
             column = int(np.argmax(np.abs(self.A[row])))
             sign = "" if self.A[row, column] > 0 else "−"
             if column != row or sign:
-                said.append(f"{_AXES[row]} reads {sign}{_AXES[column]}")
-        return ", ".join(said)
+                readings.append(f"{_AXES[row]} reads {sign}{_AXES[column]}")
+        return ", ".join(readings)
 
     def raise_if_wrong(self, where: str = "imu") -> None:
         """Raise if the stated mounting is contradicted."""

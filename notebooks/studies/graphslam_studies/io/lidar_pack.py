@@ -178,20 +178,20 @@ def read_lidar_pack(
     streams: dict[str, Stream] = {
         "clouds": PointClouds(times=times[keep], source=source, index=keep, origin=np.array(origin, dtype=np.float64))
     }
-    says = "none"
+    origin_of = "none"
     if matrices is not None:
         poses = _poses(matrices[keep])
         streams["odometry"] = _odometry(times[keep], poses, odometry_sigmas)
-        says = f"{pose_file}: the poses the odometry was made of; not independent"
+        origin_of = f"{pose_file}: the poses the odometry was made of; not independent"
         if reference is not None:
-            poses, says = (
+            poses, origin_of = (
                 _poses(reference[keep]),
                 "optimized_poses.txt: a pose graph over the odometry; not independent",
             )
         streams["reference"] = Trajectory(times[keep], poses)
     elif reference is not None:
         streams["reference"] = Trajectory(times[keep], _poses(reference[keep]))
-        says = "optimized_poses.txt"
+        origin_of = "optimized_poses.txt"
     return SensorLog(
         name=name or root.name,
         streams=streams,
@@ -201,7 +201,7 @@ def read_lidar_pack(
             "source": root.name,
             "step": step,
             "stamps": stamped_by,
-            "reference": says,
+            "reference": origin_of,
             **({"odometry_sigmas": list(odometry_sigmas)} if matrices is not None else {}),
         },
     )

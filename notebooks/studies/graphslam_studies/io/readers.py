@@ -46,12 +46,12 @@ def _mrclam(look: SourceProbe) -> ReaderMatch | None:
     robots = [p for p in look.files if re.fullmatch(r"robot\d+_odometry\.dat", plain_name(p))]
     if not robots:
         return None
-    said = f"UTIAS MRCLAM, {len(robots)} robots"
+    text = f"UTIAS MRCLAM, {len(robots)} robots"
     if look.path.is_file() or len({p.parent for p in robots}) > 1:
-        return ReaderMatch(said, "the one folder that holds Barcodes.dat and the files of its robots")
+        return ReaderMatch(text, "the one folder that holds Barcodes.dat and the files of its robots")
     if look.named("barcodes.dat") is None:
-        return ReaderMatch(said, "Barcodes.dat beside them: which barcode is which landmark")
-    return ReaderMatch(said)
+        return ReaderMatch(text, "Barcodes.dat beside them: which barcode is which landmark")
+    return ReaderMatch(text)
 
 
 def _plaza(look: SourceProbe) -> ReaderMatch | None:
@@ -60,10 +60,10 @@ def _plaza(look: SourceProbe) -> ReaderMatch | None:
     if not tables:
         return None
     prefix = plain_name(tables[0])[: -len("_dr.txt")]
-    said = f"Plaza (range only), {tables[0].name}"
+    text = f"Plaza (range only), {tables[0].name}"
     if look.path.is_file() or look.named(f"{prefix}_td.txt") is None:
-        return ReaderMatch(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
-    return ReaderMatch(said)
+        return ReaderMatch(text, f"the folder with {prefix}_TD.txt, the ranges, in it")
+    return ReaderMatch(text)
 
 
 def _tagged(look: SourceProbe, tags: tuple[str, ...]) -> Path | None:
