@@ -163,18 +163,18 @@ def minimum_entropy_topology(
             bar.update(at.step - bar.n)
 
         result = front.result(source, seed=SeedTree(settings["seed"]).child("frontend"), watch=watch)
-    told, left_out = hypotheses_of(result, most, drift=front.config.drift, handover=front.config.segslam.handover)
+    topologies, left_out = hypotheses_of(result, most, drift=front.config.drift, handover=front.config.segslam.handover)
     alternatives = solve_hypotheses(
-        told,
+        topologies,
         config,
         find=find_config(config),
         division=None if reach is None else DivisionConfig(reach=reach + REACH_MARGIN),
         streams=streams,
         progress=progress,
     )
-    model = next(iter(told[0].grids.values())).model
+    model = next(iter(topologies[0].grids.values())).model
     found = MinimumEntropyMap(rank_alternatives(alternatives, model=model, progress=progress), left_out)
-    return _finished(run, found, told[found.choice.best.number].submaps)
+    return _finished(run, found, topologies[found.choice.best.number].submaps)
 
 
 def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:

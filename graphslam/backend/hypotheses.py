@@ -258,15 +258,15 @@ class TopologyHypothesis:
         }
 
 
-def _withdrawn(told: TopologyHypothesis) -> list[TopologyHypothesis]:
+def _withdrawn(h: TopologyHypothesis) -> list[TopologyHypothesis]:
     """A topology without each of its entries in turn, the least supported entry first."""
     out = []
-    for k, s in enumerate(told.submaps):
+    for k, s in enumerate(h.submaps):
         for m in s.matches:
             rest = replace(s, matches=tuple(x for x in s.matches if x is not m))
-            submaps = [*told.submaps[:k], rest, *told.submaps[k + 1 :]]
-            support = told.support * max(1.0 - m.support, 0.0)
-            out.append(TopologyHypothesis(told.particle, support, (m.target, s.key), told.chain, submaps, told.grids))
+            submaps = [*h.submaps[:k], rest, *h.submaps[k + 1 :]]
+            support = h.support * max(1.0 - m.support, 0.0)
+            out.append(TopologyHypothesis(h.particle, support, (m.target, s.key), h.chain, submaps, h.grids))
     return sorted(out, key=lambda x: -x.support)
 
 
@@ -310,19 +310,19 @@ def hypotheses_of(
     chains = [(p, support, chain) for p, support, chain in kept]
     for chain in _sampled(result, samples, [chain for *_, chain in kept]):
         chains.append((-1, sum(w for _, w, c in found if topology(segmap, c) == topology(segmap, chain)), chain))
-    told = []
+    hypotheses = []
     for particle, support, chain in chains:
         submaps = submaps_of_segments(
             segmap, chain, drift_by_path(segmap, chain, drift, result.steps), handover, uses=result.steps.uses
         )
-        told.append(
+        hypotheses.append(
             TopologyHypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps))
         )
-    return [*told, *_withdrawn(told[0])[: most - len(kept)]], len(found) - len(kept)
+    return [*hypotheses, *_withdrawn(hypotheses[0])[: most - len(kept)]], len(found) - len(kept)
 
 
 def solve_hypotheses(
-    told: Sequence[TopologyHypothesis],
+    hypotheses: Sequence[TopologyHypothesis],
     config: BackEndConfig,
     *,
     find: FindConfig | None = None,
@@ -350,7 +350,7 @@ def solve_hypotheses(
     options = replace(config, match_support=math.inf, loops=False)
     pieces: dict[int, DividedSubmaps] = {}
     out = []
-    for number, h in enumerate(Bar(told, "hypotheses", shown=progress)):
+    for number, h in enumerate(Bar(hypotheses, "hypotheses", shown=progress)):
         back = build_back_end(h.submaps, options, **streams())
         back.solver.solve_to_optimum()
         # a withdrawn entry must not be found again by registration: that is the other hypothesis

@@ -79,7 +79,7 @@ class SensorBiases:
         """
         s = self.sigmas
         w, V = np.linalg.eigh(s[:, None] * self.information * s)
-        told = w > 1e-6
-        R = np.sqrt(w[told])[:, None] * V[:, told].T / s
-        d = (V[:, told].T @ (s * self.score)) / np.sqrt(w[told])
+        informed = w > 1e-6
+        R = np.sqrt(w[informed])[:, None] * V[:, informed].T / s
+        d = (V[:, informed].T @ (s * self.score)) / np.sqrt(w[informed])
         return R, d

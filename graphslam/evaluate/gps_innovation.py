@@ -185,10 +185,10 @@ def gps_innovations(
     parts = [(slice(d * k, d * k + d), c, j) for k, (c, j) in enumerate(zip(columns, J))]
     turn = by[:, :, :2] if d == 2 else by[:, :, 3:6]  # the node's axes in the GPS frame
     rank = np.cumsum(found) - 1
-    for told in inner:
-        for k, fix in enumerate(rank[told.fixes].tolist()):
-            moved = turn[fix] @ told.jacobian[2 * k : 2 * k + 2]
-            parts.append((slice(d * fix, d * fix + d), told.columns, moved))
+    for antennas in inner:
+        for k, fix in enumerate(rank[antennas.fixes].tolist()):
+            moved = turn[fix] @ antennas.jacobian[2 * k : 2 * k + 2]
+            parts.append((slice(d * fix, d * fix + d), antennas.columns, moved))
     needed = np.unique(np.concatenate([c for _, c, _ in parts]))
     needed = needed[needed >= 0]
     A = np.zeros((d * n, len(needed)))
@@ -312,12 +312,12 @@ def antenna_places(graph: FactorGraph, times: Array, lever: Array) -> tuple[Ints
             at = [known.path.at(t, lever) for t in times[mine].tolist()]
             pairs = [(f, p) for f, p in zip(mine.tolist(), at) if p is not None]
             if pairs:
-                told = _inner(graph, s, np.array([f for f, _ in pairs]), np.array([p for _, p in pairs]))
-                inner.append(told)
-                inside[told.fixes] = False
-                node[told.fixes], arm[told.fixes] = s.node, told.places
-                ix = (d * told.fixes[:, None] + np.arange(d)).ravel()
-                cov[np.ix_(ix, ix)] = told.left
+                antennas = _inner(graph, s, np.array([f for f, _ in pairs]), np.array([p for _, p in pairs]))
+                inner.append(antennas)
+                inside[antennas.fixes] = False
+                node[antennas.fixes], arm[antennas.fixes] = s.node, antennas.places
+                ix = (d * antennas.fixes[:, None] + np.arange(d)).ravel()
+                cov[np.ix_(ix, ix)] = antennas.left
         at_node = s.before(times)
         for i in range(len(s.nodes) - 1):
             rows = np.flatnonzero(inside & (at_node == i))

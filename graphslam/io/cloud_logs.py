@@ -143,7 +143,7 @@ def read_clouds(
         raise MissingDataError("no such folder", where=str(root), wanted="a folder of clouds, one file a scan")
     look = SourceProbe(root)
     files, _ = cloud_folder(look)
-    told = ""
+    note = ""
     if columns is None:
         bins = [p for p in files if p.name.lower().endswith(".bin")]
         columns = (
@@ -152,7 +152,7 @@ def read_clouds(
             else BIN_COLUMNS
         )
         if bins and columns != BIN_COLUMNS:
-            told = f"BIN of {columns} columns, by their content (--reader-option columns=)"
+            note = f"BIN of {columns} columns, by their content (--reader-option columns=)"
     table: Path | None = None
     if poses is None:
         table = pose_file(look)
@@ -162,7 +162,7 @@ def read_clouds(
     counter = DropCounter()
     beside = None if table is None else PoseTable.read(look, table, counter)
     log = folder.log(beside, scan_stamps(folder, beside, period), odometry_sigmas, {}, counter)
-    return replace(log, meta={**log.meta, "notes": [told, *log.meta["notes"]]}) if told else log
+    return replace(log, meta={**log.meta, "notes": [note, *log.meta["notes"]]}) if note else log
 
 
 @dataclass(frozen=True, slots=True)

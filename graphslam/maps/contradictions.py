@@ -135,8 +135,8 @@ def find_contradictions(
         found = [found[k * len(found) // PAIRS] for k in range(PAIRS)]
     rows = [_compared(clouds[i], g.between(bases[j], bases[i]), some[j], model) for i, j in found]
     keys = np.array([(names[i][0], names[j][0]) for i, j in found], dtype=np.int64).reshape(-1, 2)  # type: ignore[index]
-    told = np.array(rows, dtype=np.int64).reshape(-1, 2)
-    return Contradictions(keys, told[:, 0], told[:, 1])
+    pairs = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return Contradictions(keys, pairs[:, 0], pairs[:, 1])
 
 
 def _solid(piece: Piece, threshold: int) -> Array:

@@ -247,8 +247,8 @@ class GridFilter:
             gains = np.zeros(len(p))
             points, origins, returns = self.steps.scan(k)
             weighed = self.weighed_beams(k)
-            told = maps_with_enough_scans(p.ages, config.young)
-            rows = np.flatnonzero(told)
+            known = maps_with_enough_scans(p.ages, config.young)
+            rows = np.flatnonzero(known)
             if weighed and len(rows):
                 for beams, likelihood in weighed:
                     gains[rows] += log_weights(
@@ -261,7 +261,7 @@ class GridFilter:
                         returns=returns[beams],
                         threads=config.threads,
                     )
-                gains = fill_with_mean_likelihood(gains, p.log_weights, told)
+                gains = fill_with_mean_likelihood(gains, p.log_weights, known)
                 p.gain(gains)
             return gains
 

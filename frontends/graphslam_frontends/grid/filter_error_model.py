@@ -132,7 +132,7 @@ class FilterDrift:
         *,
         gravity: bool = True,
         reckoned: Array | None = None,
-        told_tilt: float | None = None,
+        tilt_sigma: float | None = None,
     ) -> Array:
         """Right-tangent covariance at the end of a path.
 
@@ -145,7 +145,7 @@ class FilterDrift:
         reckoned : (d, d), optional
             Covariance of dead reckoning over the path, a fraction of which is added; without it a single particle has
             the heading walk ``alone_walk``, and nothing is added to the error of the filter itself.
-        told_tilt : float, optional
+        tilt_sigma : float, optional
             σ of roll and pitch by gravity, if measured [rad].
         """
         poses = np.asarray(path, dtype=np.float64)
@@ -178,7 +178,7 @@ class FilterDrift:
         if group.dim == 3:
             C[5, 5] += HEIGHT_START**2 + self.height_walk**2 * length + (HEIGHT_SCALE * length) ** 2
             C[[0, 1], [0, 1]] += self.tilt**2
-        return C if reckoned is None else C + PASSED.covariance(reckoned, length, particles, tilt=told_tilt)
+        return C if reckoned is None else C + PASSED.covariance(reckoned, length, particles, tilt=tilt_sigma)
 
 
 def interpolate_covariances(knots: npt.NDArray[np.int64], covariances: Array, poses: Array, along: Array) -> Array:

@@ -28,25 +28,25 @@ def maps_with_enough_scans(ages: Ints, young: int) -> Flags:
     return np.asarray((ages >= min(young, oldest)) & (ages > 0))
 
 
-def fill_with_mean_likelihood(gains: Array, log_weights: Array, told: Flags) -> Array:
-    """Log-likelihoods ``(n,)`` in which particles not ``told`` get the mean likelihood of the others.
+def fill_with_mean_likelihood(gains: Array, log_weights: Array, known: Flags) -> Array:
+    """Log-likelihoods ``(n,)`` in which particles not ``known`` get the mean likelihood of the others.
 
-    The mean is weighted by the prior weights, so it is the evidence ``p(z)`` of the ``told`` ones: the total weight of
-    the others does not change. If none is ``told``: zeros.
+    The mean is weighted by the prior weights, so it is the evidence ``p(z)`` of the ``known`` ones: the total weight of
+    the others does not change. If none is ``known``: zeros.
 
     Parameters
     ----------
     gains : (n,)
-        Log-likelihoods; only those of ``told`` particles are read.
+        Log-likelihoods; only those of ``known`` particles are read.
     log_weights : (n,)
         Before this step.
-    told : (n,) bool
+    known : (n,) bool
     """
     out = np.zeros(len(gains))
-    if not told.any():
+    if not known.any():
         return out
-    prior, new = normalise_log_weights(log_weights[told]), gains[told]
+    prior, new = normalise_log_weights(log_weights[known]), gains[known]
     top = float(new.max())
-    out[told] = new
-    out[~told] = top + float(np.log(np.sum(prior * np.exp(new - top))))
+    out[known] = new
+    out[~known] = top + float(np.log(np.sum(prior * np.exp(new - top))))
     return out

@@ -133,7 +133,7 @@ class KissIcpOdometry(LidarOdometry):
         chosen: Index,
         predicted: Array,
         bridge: Array | None,
-        told: Array | None,
+        spread: Array | None,
         time: float,
         by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:

@@ -98,11 +98,11 @@ class PreparedLog:
 
     def usual_sigma(self, scan: int) -> Array:
         """Mean measurement noise up to and including a scan, as x, y [m] and heading [rad]."""
-        n, (ranges, bearings, told) = int(self.observations.offsets[scan + 1]), self.noise[scan + 1]
+        n, (ranges, bearings, count) = int(self.observations.offsets[scan + 1]), self.noise[scan + 1]
         if not n:
             return np.ones(3)
         along = np.sqrt(ranges / n)
-        return np.array([along, along, np.sqrt(bearings / told) if told else np.inf])
+        return np.array([along, along, np.sqrt(bearings / count) if count else np.inf])
 
     def unseen_gap(self, scan: int) -> bool:
         """Does a gap of the motion without scans end at this scan? Then the motion in it is unknown."""
@@ -310,8 +310,8 @@ class LogPreparation:
         if t_start < scans.times[0]:  # record k of the odometry is then the motion into scan k
             odometry = odometry.take(slice(1, None))
         rows = np.column_stack([scans.ranges, scans.bearings, filter_var])
-        told = np.isfinite(filter_var[:, 1])
-        each = np.column_stack([filter_var[:, 0], np.where(told, filter_var[:, 1], 0.0), told])
+        finite = np.isfinite(filter_var[:, 1])
+        each = np.column_stack([filter_var[:, 0], np.where(finite, filter_var[:, 1], 0.0), finite])
         sums = np.cumsum(np.concatenate([np.zeros((1, 3)) if before is None else before.noise[-1:], each]), axis=0)
         new = PreparedLog(
             scans,

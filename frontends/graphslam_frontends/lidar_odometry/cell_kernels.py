@@ -395,7 +395,7 @@ def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: floa
 
 @njit(nogil=True)
 def cell_normal_equations(
-    c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, told: F8
+    c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, sums: F8
 ) -> None:
     """Gauss–Newton normal equations of points on cells, with Geman–McClure weights.
 
@@ -409,13 +409,13 @@ def cell_normal_equations(
         Mahalanobis distance at which the weight is 1/4.
     H, g : (6, 6), (6,)
         Out: right tangent, rotation first; ``H δ = -g``.
-    told : (13,)
+    sums : (13,)
         Out: sum of weights; number of points with an informative cell; weighted sum of squared Mahalanobis distances;
         then the sum of weights times traces of information, of these times the points (3), and times their squares (6:
         xx, xy, xz, yy, yz, zz).
     """
     notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
-    _normal_equations(c, points, pose, size, scale, (H, g, told), notes)
+    _normal_equations(c, points, pose, size, scale, (H, g, sums), notes)
 
 
 @njit
@@ -429,11 +429,11 @@ def _normal_equations(
     notes: tuple[I8, I8],
 ) -> None:
     """``notes``: the last cached cube of each point, and its nearest cell."""
-    (R, t), (H, g, told), (asked, found) = pose, out, notes
+    (R, t), (H, g, sums), (asked, found) = pose, out, notes
     fine = FINE / size
     H[:, :] = 0.0
     g[:] = 0.0
-    told[:] = 0.0
+    sums[:] = 0.0
     inverse = 1.0 / (scale * scale)
     rows = c.root.shape[1]
     r = np.empty(3)
@@ -462,20 +462,20 @@ def _normal_equations(
             continue
         w = 1.0 / (1.0 + m * inverse)
         w *= w
-        told[0] += w
-        told[1] += 1.0
-        told[2] += w * m
+        sums[0] += w
+        sums[1] += 1.0
+        sums[2] += w * m
         trace *= w
-        told[3] += trace
-        told[4] += trace * a
-        told[5] += trace * b
-        told[6] += trace * e
-        told[7] += trace * a * a
-        told[8] += trace * a * b
-        told[9] += trace * a * e
-        told[10] += trace * b * b
-        told[11] += trace * b * e
-        told[12] += trace * e * e
+        sums[3] += trace
+        sums[4] += trace * a
+        sums[5] += trace * b
+        sums[6] += trace * e
+        sums[7] += trace * a * a
+        sums[8] += trace * a * b
+        sums[9] += trace * a * e
+        sums[10] += trace * b * b
+        sums[11] += trace * b * e
+        sums[12] += trace * e * e
         for k in range(rows):
             # the row in the body frame; the derivative of its residual is [p × u, u]
             ux = R[0, 0] * W[k, 0] + R[1, 0] * W[k, 1] + R[2, 0] * W[k, 2]

@@ -159,10 +159,10 @@ class CellMap:
         return H, M, G
 
 
-def _fit(n: int, H: Array, g: Array, told: Array) -> NormalEquations:
-    near = max(told[1], 1.0)
+def _fit(n: int, H: Array, g: Array, sums: Array) -> NormalEquations:
+    near = max(sums[1], 1.0)
     return NormalEquations(
-        H, g, _every(told[3:]), told[0] / max(n, 1), told[1] / max(n, 1), told[0] / near, told[2] / max(told[0], 1e-12)
+        H, g, _every(sums[3:]), sums[0] / max(n, 1), sums[1] / max(n, 1), sums[0] / near, sums[2] / max(sums[0], 1e-12)
     )
 
 

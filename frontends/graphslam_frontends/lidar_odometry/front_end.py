@@ -181,7 +181,7 @@ class LidarFrontEnd(FrontEnd):
         self._made[:] = [feed, seen, unit, wheels.name]
         config = self.config.submap
         kept: list[FollowedScan] = []
-        k, key, way, told, mapped, most = -1, 0, 0.0, False, False, 0
+        k, key, way, warned, mapped, most = -1, 0, 0.0, False, False, 0
         while True:
             while not feed.ended and (
                 feed.count(name) <= k + 2
@@ -204,8 +204,8 @@ class LidarFrontEnd(FrontEnd):
             n = len(kept) - 1
             full = odometry.way - way >= config.length and n >= config.scans
             if k == scans - 1 or full or n >= MOST_SCANS:
-                bent = [] if told else [*_bent(key, kept), *_uneven(key, kept)]
-                told = told or bool(bent)
+                bent = [] if warned else [*_bent(key, kept), *_uneven(key, kept)]
+                warned = warned or bool(bent)
                 if n and key >= first:
                     ended = "end-of-log" if k == scans - 1 else "length"
                     origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)

@@ -279,12 +279,12 @@ class LidarOdometry:
         before = self.pose
         even = se3.se3_compose(before, self.predict(time))
         ahead = None if self.inertial is None else self.inertial.ahead(time)
-        told, bridge, Q, led = None, None, None, False
+        reckoned, bridge, Q, led = None, None, None, False
         if self.reckoned is not None and self.scan > 0:
-            told = self.reckoned.motion(self.time, time)
-            if told is not None and self.reckoned.useful:
-                bridge = np.asarray(se3.se3_compose(before, told[0]))
-                Q = np.diag(np.repeat(self.reckoned.variances(told[1]), 3))
+            reckoned = self.reckoned.motion(self.time, time)
+            if reckoned is not None and self.reckoned.useful:
+                bridge = np.asarray(se3.se3_compose(before, reckoned[0]))
+                Q = np.diag(np.repeat(self.reckoned.variances(reckoned[1]), 3))
                 led = ahead is None and (self.lost > 0 or self.reckoned.better)
         predicted = ahead if ahead is not None else bridge if led and bridge is not None else even
         rows = first_rows_by_cube(np.ascontiguousarray(cloud), SPACING, (c.min_range, c.max_range))
@@ -312,9 +312,9 @@ class LidarOdometry:
         motion = np.asarray(se3.se3_between(before, predicted))
         self._doubt(raw, points, motion, even, dt, fit, seen, self._instead(seen, motion, Q))
         sure = fit is not None and not seen.unobservable and not self.lost and seen.state in MAPPED
-        if sure and told is not None and self.reckoned is not None:
+        if sure and reckoned is not None and self.reckoned is not None:
             made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
-            self.reckoned.learn(told[0], made, guess)
+            self.reckoned.learn(reckoned[0], made, guess)
         if self.inertial is not None and seen.state in MAPPED:
             self.inertial.learn(time, self.pose, even)
         if seen.state in MAPPED:
@@ -462,7 +462,7 @@ class LidarOdometry:
         chosen: Index,
         predicted: Array,
         bridge: Array | None,
-        told: Array | None,
+        reckoned: Array | None,
         time: float,
         by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
@@ -475,7 +475,7 @@ class LidarOdometry:
             Initial guess of the match.
         bridge : (7,) or None
             Pose by odometry; used along unobservable directions.
-        told : (6, 6) or None
+        reckoned : (6, 6) or None
             Covariance of that motion; None: that of constant velocity, estimated from recent scans.
         time : float
             [s]
@@ -525,7 +525,7 @@ class LidarOdometry:
             if few_of_it and fit.overlap < SUSPICIOUS * np.median(self.overlaps):
                 # after lost scans, little overlap means a misplaced scan, not new space
                 fits = fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
-                spread = self.spread if told is None else told
+                spread = self.spread if reckoned is None else reckoned
                 state = "new space" if fits and not self.lost and not _far(stands, pose, spread) else "lost"
         free, (pose, unobservable) = pose, self._hold(pose, stands, fit)
         if inertial is not None and state != "lost":

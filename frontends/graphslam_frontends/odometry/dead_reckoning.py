@@ -135,12 +135,12 @@ def integrate_imu_and_wheels(
         )
     rates = _interpolate(knots, imu.times, to_base)
     gap_rate = GAP_RATE
-    told = _turn_of_wheels(imu.times, to_base[:, 2], wheels, imu_gaps) if len(imu_gaps.begin) else None
-    if told is not None:
+    wheel_turn = _turn_of_wheels(imu.times, to_base[:, 2], wheels, imu_gaps) if len(imu_gaps.begin) else None
+    if wheel_turn is not None:
         inside = imu_gaps.length_at(knots) > 0
         latest = np.searchsorted(wheels.times, knots[inside], side="right") - 1
-        rates[inside, 2] = told[0] * wheels.yaw_rate[latest]
-        gap_rate = told[1]
+        rates[inside, 2] = wheel_turn[0] * wheels.yaw_rate[latest]
+        gap_rate = wheel_turn[1]
     fine = _fine_steps(knots, tilt, rates, speed)
 
     # variances per second of the white noise: heading, distance, and along the axes of the base

@@ -72,7 +72,7 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
             return model.covariance(path, segmap.particles, gravity=level_here)
         reckoned = dead_reckoning_covariance(steps, start, end, level_end=level_here)
         tilt = None if steps.tilt is None else steps.tilt_sigma
-        C = model.covariance(path, segmap.particles, gravity=level_here, reckoned=reckoned, told_tilt=tilt)
+        C = model.covariance(path, segmap.particles, gravity=level_here, reckoned=reckoned, tilt_sigma=tilt)
         return C + unobserved_covariance(steps, stretches, path, start, end)
 
     return drift

@@ -23,9 +23,9 @@ STAGES = {
 
 def bar_among(progress: bool | Sequence[Observer]) -> tuple[RunBar, list[Observer]]:
     """The progress bar of a run, and all observers with the bar first."""
-    told = [] if isinstance(progress, bool) else list(progress)
-    bar = next((o for o in told if isinstance(o, RunBar)), None) or RunBar(progress is True)
-    return bar, [bar, *(o for o in told if o is not bar)]
+    observers = [] if isinstance(progress, bool) else list(progress)
+    bar = next((o for o in observers if isinstance(o, RunBar)), None) or RunBar(progress is True)
+    return bar, [bar, *(o for o in observers if o is not bar)]
 
 
 class RunBar(Observer):

@@ -84,15 +84,15 @@ def _shares(submaps: Sequence[Submap]) -> list[Finding]:
 def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
     """Findings of front ends on submaps; of equal ones, the first two in full and the keys of the others."""
     findings = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
-    told: dict[tuple[Level, str], list[int]] = {}
+    submaps_of: dict[tuple[Level, str], list[int]] = {}
     out = []
     for key, f in findings:
-        keys = told.setdefault((f.level, f.code), [])
+        keys = submaps_of.setdefault((f.level, f.code), [])
         if key not in keys:
             keys.append(key)
         if len(keys) <= ALIKE:
             out.append(f)
-    for (level, code), keys in told.items():
+    for (level, code), keys in submaps_of.items():
         if more := keys[ALIKE:]:
             some = ", ".join(map(str, more[:12])) + (", …" if len(more) > 12 else "")
             text = f"{code}: {len(more)} more submaps ({some}) — details are in their reports."

@@ -136,11 +136,11 @@ def loop_consensus(network: PoseNetwork) -> LoopConsensus:
     loops = LoopArrays.of(
         chain, network.edges[rows], network.measurements[rows], np.linalg.inv(network.information[rows])
     )
-    told = _informative(chain, loops)
-    rows = rows[told]
+    informative = _informative(chain, loops)
+    rows = rows[informative]
     if len(rows) < 2:
         return nothing
-    loops = LoopArrays(loops.ends[told], loops.measured[told], loops.covariance[told])
+    loops = LoopArrays(loops.ends[informative], loops.measured[informative], loops.covariance[informative])
     near = min(NEIGHBOURS, len(rows) - 1)
     distance, other = cKDTree(loops.ends.astype(np.float64)).query(loops.ends, k=near + 1, p=1)
     # the loop itself is among the nearest, but not always first: two loops can have the same nodes

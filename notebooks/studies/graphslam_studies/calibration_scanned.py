@@ -154,9 +154,9 @@ def _measurements(
     yield Measurement(name, "distance_scale_sigma_told", sigma)
     yield Measurement(name, "distance_scale_applied", float(b["distance_scale"].applied))
     both = [x["yaw_bias"] for x in (a, b) if "yaw_bias" in x]
-    told = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < SURELY
-    yield Measurement(name, "yaw_bias_told", float(told))
-    if told:
+    estimated = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < SURELY
+    yield Measurement(name, "yaw_bias_told", float(estimated))
+    if estimated:
         yield Measurement(name, "yaw_bias_error", both[1].value - both[0].value - added.bias)
     rates = {"yaw_bias": 1.0, "turn_per_metre": speed}
     turning = [sum(rate * x[n].value for n, rate in rates.items() if n in x) for x in (a, b)]

@@ -164,14 +164,14 @@ def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
     }
     detections: LandmarkObservations = log["landmarks"]
     r, b = detections.ranges.copy(), detections.bearings.copy()
-    told = np.array([c.sensor[0], np.deg2rad(c.sensor[1])])
+    sigmas = np.array([c.sensor[0], np.deg2rad(c.sensor[1])])
     if w.tails:
         wild = rng.random(len(r)) < w.tails
-        more = 8.0 * told * rng.standard_normal((len(r), 2))
+        more = 8.0 * sigmas * rng.standard_normal((len(r), 2))
         r = np.maximum(np.where(wild, r + more[:, 0], r), 0.05)
         b = np.where(wild, wrap_angle(b + more[:, 1]), b)
     streams["landmarks"] = replace(
-        detections, ranges=r, bearings=b, sigmas=np.broadcast_to(told, detections.sigmas.shape).copy()
+        detections, ranges=r, bearings=b, sigmas=np.broadcast_to(sigmas, detections.sigmas.shape).copy()
     )
     if w.gps != "none":
         streams["gps"] = fixes_of(w, path.times, path.poses, seed.child("gps").generator())

@@ -173,8 +173,8 @@ def _figures(config: WithheldConfig) -> Iterator[Measurement]:
         low, high = max(low, imu.times[0] + EDGE), min(high, imu.times[-1] - EDGE)
         fixes = fixes.take((fixes.times >= low) & (fixes.times <= high))
         used = used_of(fixes.times, config.every)
-        told = fixes.take(used)
-        attitude, bias = inertial_start(imu, told.times, told.positions)
+        fixed = fixes.take(used)
+        attitude, bias = inertial_start(imu, fixed.times, fixed.positions)
         attitudes = integrate_attitude(attitude, imu, fixes.times, bias)
         values = scores(graph_of_fixes(imu, fixes, used, attitudes), fixes, used)
     else:
@@ -199,8 +199,8 @@ def scores(graph: FactorGraph, fixes: Gps, used: Mask) -> dict[str, float]:
     """Metrics of a graph of :func:`graph_of_fixes`; see the module."""
     off = predicted(graph, fixes) - fixes.positions
     wrong = np.linalg.norm(off[~used], axis=1)
-    told = fixes.take(used)
-    line = np.stack([np.interp(fixes.times, told.times, c) for c in told.positions.T], axis=-1) - fixes.positions
+    fixed = fixes.take(used)
+    line = np.stack([np.interp(fixes.times, fixed.times, c) for c in fixed.positions.T], axis=-1) - fixes.positions
     rows = np.flatnonzero(~used)
     some = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int))]
     seen = gps_innovations(graph, fixes.take(some))

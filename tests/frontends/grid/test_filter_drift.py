@@ -136,7 +136,7 @@ def test_a_single_particle_passes_everything_on_and_more_never_less_than_nothing
     # of one the heading walks as dead reckoning says, not as the robot that the model was fitted to
     assert quiet.covariance(path, 1, reckoned=O) - O == pytest.approx(quiet.covariance(path, 40))
     for tilt in (None, 0.005):
-        more = MODEL.covariance(path, 20, reckoned=O, told_tilt=tilt) - MODEL.covariance(path, 20)
+        more = MODEL.covariance(path, 20, reckoned=O, tilt_sigma=tilt) - MODEL.covariance(path, 20)
         assert np.linalg.eigvalsh(more).min() > -1e-12  # the fitted constants are a floor
         assert more == pytest.approx(PASSED.covariance(O, 40.0, 20, tilt=tilt), rel=1e-3, abs=1e-12)
 

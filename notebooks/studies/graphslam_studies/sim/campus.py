@@ -219,8 +219,8 @@ def simulate_campus(
         passers = MovingObjects(movers, scans.ranges.shape, c.max_range)
         cast = cast_scans(scans, motion, caster, sensors, seeds.child(name), nearer=passers, progress=progress)
         assert cast.spin is not None
-        told = cast.spin + c.encoder_offset if name == "panning" else cast.spin
-        streams[name] = replace(cast, times=cast.times + c.clock_offset, spin=told)
+        spin = cast.spin + c.encoder_offset if name == "panning" else cast.spin
+        streams[name] = replace(cast, times=cast.times + c.clock_offset, spin=spin)
         returned = np.isfinite(cast.ranges) & (cast.ranges < c.max_range)
         moving[name] = BeamLabels(cast.times + c.clock_offset, np.where(returned, passers.labels, -1))
     bias = drawn["gyro_bias"] * float(seeds.child("yaw bias").generator().standard_normal())
