@@ -57,9 +57,9 @@ def run_records(run: Run, factory: MessageFactory, confidence: float, fused: Run
     for stamp, T, C in zip(stamps, poses, P):
         head, pose = factory.header(stamp, MAP), factory.pose(T)
         placed.append(factory.make("geometry_msgs/PoseStamped", header=head, pose=pose))
-        sure = factory.make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=C.reshape(-1))
+        full = factory.make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=C.reshape(-1))
         yield BagRecord("/tf", factory.transforms(stamp, MAP, BASE, T), stamp)
-        yield BagRecord("/pose", factory.make("geometry_msgs/PoseWithCovarianceStamped", header=head, pose=sure), stamp)
+        yield BagRecord("/pose", factory.make("geometry_msgs/PoseWithCovarianceStamped", header=head, pose=full), stamp)
     first = stamps[0]
     whole = factory.make("nav_msgs/Path", header=factory.header(first, MAP), poses=placed)
     yield BagRecord("/path", whole, first, latched=True)

@@ -119,8 +119,8 @@ def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> M
         ends = [*solution.base_nodes.tolist(), int(solution.exit_nodes[-1])]
         nodes = {s.key: (solution.node_times[a:b], solution.poses[a:b]) for s, a, b in zip(run.submaps, ends, ends[1:])}
         candidate = MapHypothesis(made.divided.pieces, solved_poses(made.divided, nodes), name)
-        taken = sum(key == LOOP for key, _ in chosen)
-        facts = {"matches": len(chosen) - taken, "loops": taken}
+        loop_count = sum(key == LOOP for key, _ in chosen)
+        facts = {"matches": len(chosen) - loop_count, "loops": loop_count}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
     choice = rank_alternatives(alternatives, model=made.fused.grid.model, progress=progress)
     return _finished(run, MinimumEntropyMap(choice, len(every) - len(choices)), run.submaps)
@@ -197,8 +197,8 @@ def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence
     """The chosen alternative refined with the scans of the run, if the run is refined."""
     values = read_options(folder)
     config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
-    taken, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
-    if taken is None or taken.scans is None:
+    inputs, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
+    if inputs is None or inputs.scans is None:
         return found
     check_same((folder / "run.json", run.report.get("generation")), (folder / "taken.npz", generation))
     solution = found.choice.best.alternative.solution
@@ -206,7 +206,7 @@ def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
         gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))
-    refined, findings = refine_run(config, taken.scans, submaps, solved, gps=gps)
+    refined, findings = refine_run(config, inputs.scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
         return replace(found, refined=refined, findings=findings)
     options: MapConfig = build_config(MapConfig, values.get("map", {}), "map")
@@ -226,9 +226,9 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
     imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")
     feed: RecordSource | None = None
     if imu.use != "none" and run.folder is not None:
-        taken, generation = read_consistently(run.folder, read_inputs)
+        inputs, generation = read_consistently(run.folder, read_inputs)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
-        feed = RecordSource(taken.log)
+        feed = RecordSource(inputs.log)
     if run.folder is None and "control_points" in run.report:
         raise MissingDataError("only its folder holds the control points of a run", wanted="a run with out=…")
     control = None if run.folder is None else RunOptions.of_folder(run.folder).table("control")

@@ -47,14 +47,14 @@ def nearest_neighbour_pairs(d2: Array, i: Ints, j: Ints) -> Index:
     """
     seen: set[int] = set()
     used: set[int] = set()
-    taken = []
+    accepted = []
     for k in np.argsort(d2, kind="stable"):
         a, b = int(i[k]), int(j[k])
         if a not in seen and b not in used:
             seen.add(a)
             used.add(b)
-            taken.append(k)
-    return np.asarray(taken, dtype=np.intp)
+            accepted.append(k)
+    return np.asarray(accepted, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True)

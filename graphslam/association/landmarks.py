@@ -111,8 +111,8 @@ def associate_landmarks(graph: FactorGraph, submap: Submap, config: AssociationC
         return np.zeros(0, dtype=np.int64)
     ids = submap.landmarks.ids.copy()
     unknown = np.flatnonzero(ids < 0)
-    taken = set(ids[ids >= 0].tolist())
-    pairs = find_pairings(graph, submap, unknown, cfg, exclude=taken)
+    used = set(ids[ids >= 0].tolist())
+    pairs = find_pairings(graph, submap, unknown, cfg, exclude=used)
     if len(pairs.observed) == 0:
         return ids
     if cfg.method == "nearest-neighbour":

@@ -103,14 +103,14 @@ def choices_of_matches(
     """
     every = {(s.key, i): m for s in submaps for i, m in enumerate(s.matches)}
     found_loops: Chosen = frozenset((LOOP, d.loop) for d in loops)
-    taken: Chosen = frozenset(k for k, m in every.items() if m.support >= support and (k[0], m.target) not in undone)
-    own = taken | found_loops
+    matches: Chosen = frozenset(k for k, m in every.items() if m.support >= support and (k[0], m.target) not in undone)
+    own = matches | found_loops
     found: dict[str, Chosen] = {"as the run": own, "no match or loop" if loops else "no match": frozenset()}
-    found["matches alone"] = taken
+    found["matches alone"] = matches
     for least in sorted({m.support for m in every.values()}, reverse=True):
         at_least: Chosen = frozenset(k for k, m in every.items() if m.support >= least)
         found[f"support ≥ {least:.2g}"] = at_least | found_loops
-    for key, i in sorted(taken):
+    for key, i in sorted(matches):
         found[f"without {key} → {every[key, i].target}"] = own - {(key, i)}
     alone = [d for d in loops if d.source != TIE]
     for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # largest χ² first
@@ -150,7 +150,7 @@ def solve_choice(
     bare = []
     # two matches of one pair of submaps are distinguished by their support
     as_loops = {(d.submap_j, d.submap_i, round(d.score, 9)): d for d in decided}
-    taken = [d for d in loops if (LOOP, d.loop) in chosen]
+    used = [d for d in loops if (LOOP, d.loop) in chosen]
     for s in submaps:
         kept: list[Match] = []
         for m in (m for i, m in enumerate(s.matches) if (s.key, i) in chosen):
@@ -158,13 +158,13 @@ def solve_choice(
             if loop is None:
                 kept.append(m)
             else:
-                taken.append(loop)
+                used.append(loop)
         bare.append(replace(s, matches=tuple(kept), grid=None))
     back = build_back_end(bare, replace(config, match_support=0.0, loops=False), **streams)
     back.solver.solve_to_optimum()
-    if taken:
+    if used:
         graph = GraphLoops(back.graph, back.solver)
-        for d in taken:
+        for d in used:
             C = np.array(d.covariance)
             measured = Loop(i=d.i, j=d.j, T_ij=np.array(d.T_ij), covariance=C, source=d.source)
             graph.add_loop(measured, LoopConfig().robust(len(C)))

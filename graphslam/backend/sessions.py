@@ -282,7 +282,7 @@ def _add(graph: FactorGraph, x: Loop, known: DenseSession, new: DenseSession) ->
 def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int:
     """Remove loop closures that contradict the solved graph, worst first; returns their number."""
     g = graph.values.group
-    limit, taken = chi2_quantile(0.9999, g.dof), 0
+    limit, removed = chi2_quantile(0.9999, g.dof), 0
     while factors:
         chi2 = {}
         for fid in factors:
@@ -295,9 +295,9 @@ def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int
             break
         graph.remove(worst, reason=f"contradicted by the graph: χ² {chi2[worst]:.1f} > {limit:.1f}")
         del factors[worst]
-        taken += 1
+        removed += 1
         solver.solve_to_optimum()
-    return taken
+    return removed
 
 
 def _near(

@@ -67,30 +67,30 @@ def _add(row, n, blocks):
 
 
 @njit(error_model="numpy", nogil=True)
-def _leave(at, active, A, C, S, gone):
-    """Eliminate a border column without later observations; its row goes to ``gone``. Returns the pivot."""
+def _leave(at, active, A, C, S, row):
+    """Eliminate a border column without later observations; its row goes to ``row``. Returns the pivot."""
     D, m = C.shape
     pivot = S[at, at]
-    gone[:] = 0.0
+    row[:] = 0.0
     for b in range(at):
-        gone[b], S[b, at] = S[b, at], 0.0
+        row[b], S[b, at] = S[b, at], 0.0
     for b in range(at + 1, active):
-        gone[b], S[at, b] = S[at, b], 0.0
+        row[b], S[at, b] = S[at, b], 0.0
     S[at, at] = 0.0
     for a in range(D):
-        gone[m + a], C[a, at] = C[a, at], 0.0
+        row[m + a], C[a, at] = C[a, at], 0.0
     for a in range(active):
-        w = gone[a] / pivot
+        w = row[a] / pivot
         if w != 0.0:
             for b in range(a, active):
-                S[a, b] -= w * gone[b]
+                S[a, b] -= w * row[b]
     for a in range(D):
-        w = gone[m + a] / pivot
+        w = row[m + a] / pivot
         if w != 0.0:
             for b in range(active):
-                C[a, b] -= w * gone[b]
+                C[a, b] -= w * row[b]
             for b in range(D):
-                A[a, b] -= w * gone[m + b]
+                A[a, b] -= w * row[m + b]
     return pivot
 
 
@@ -127,7 +127,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         ln det of the eliminated blocks, and the sum of ln σ of all residuals.
     """
     steps, first, detections, slots, kinds = data
-    L, X, C, S, chi2, gone, pivots, order, when, at = work
+    L, X, C, S, chi2, rows, pivots, order, when, at = work
     n, D = poses.shape
     M = len(nuisance)
     m = C.shape[2]
@@ -207,7 +207,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                     S[col, col] *= 1.0 + damping
                     S[col + 1, col + 1] *= 1.0 + damping
                 for a in range(1, -1, -1):
-                    pivot = _leave(col + a, active, A, C[k], S, gone[2 * j + a])
+                    pivot = _leave(col + a, active, A, C[k], S, rows[2 * j + a])
                     if not pivot > 0.0:
                         return np.nan, volume
                     pivots[2 * j + a] = pivot
@@ -258,7 +258,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
 @njit(error_model="numpy", nogil=True)
 def substitute_window(work, dg, d_poses, d_nuisance):
     """Back-substitution: updates of poses (n, D) and nuisances (M, 2) for an update ``dg`` of the constants."""
-    L, X, C, _, _, gone, pivots, order, when, at = work
+    L, X, C, _, _, rows, pivots, order, when, at = work
     n, D = d_poses.shape
     m = C.shape[2]
     y = np.zeros(m)
@@ -284,9 +284,9 @@ def substitute_window(work, dg, d_poses, d_nuisance):
             for a in range(2):
                 t = 0.0
                 for b in range(m):
-                    t += gone[2 * j + a, b] * y[b]
+                    t += rows[2 * j + a, b] * y[b]
                 for b in range(D):
-                    t += gone[2 * j + a, m + b] * d_poses[k, b]
+                    t += rows[2 * j + a, m + b] * d_poses[k, b]
                 d_nuisance[j, a] = y[HEAD + 2 * at[j] + a] = -t / pivots[2 * j + a]
             last -= 1
 
@@ -357,7 +357,7 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
     work : Work of :func:`eliminate_window` for the same window, states and ``p``, undamped.
     """
     steps, first, detections, slots, kinds = data
-    L, X, C, _, _, gone, pivots, order, when, at = work
+    L, X, C, _, _, rows, pivots, order, when, at = work
     n, D = poses.shape
     m = C.shape[2]
     out = np.zeros(PARAMETERS)
@@ -389,8 +389,8 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
         while last >= 0 and when[last] == k:  # nuisances eliminated with pose k, in reverse order
             j = order[last]
             for a in range(2):
-                z[:m] = gone[2 * j + a, :m]
-                z[mine : mine + D] = gone[2 * j + a, m:]
+                z[:m] = rows[2 * j + a, :m]
+                z[mine : mine + D] = rows[2 * j + a, m:]
                 _enter(M, z, HEAD + 2 * at[j] + a, pivots[2 * j + a], 1.0 / pivots[2 * j + a])
             last -= 1
         for q in range(first[k], first[k + 1]):

@@ -129,8 +129,8 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
             found = register(targets[b], targets[a], T, config)
             if not found.converged or found.fitness < FITNESS:
                 continue
-            sure = math.sqrt(float(found.covariance[g.heading, g.heading]))
-            if found.weakest_sigma > HELD[0] or sure > HELD[1]:
+            sigma = math.sqrt(float(found.covariance[g.heading, g.heading]))
+            if found.weakest_sigma > HELD[0] or sigma > HELD[1]:
                 continue
             e = g.log(g.between(found.T_target_source, T))
             direction = np.asarray(T[: steps.dim]) / max(float(np.linalg.norm(T[: steps.dim])), 1e-9)
@@ -141,8 +141,8 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
             side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
             # translation of the match, not of the odometry: noise in the regressor would bias the scale
             chord = float(np.asarray(found.T_target_source[: steps.dim]) @ direction)
-            gone = [float(s[b] - s[a]) for s in sums]
-            rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
+            motion = [float(s[b] - s[a]) for s in sums]
+            rows.append([apart, *motion, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
         raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
     near = sum(row[0] == 1 for row in rows)

@@ -127,8 +127,8 @@ class ControlTable:
                 out.refused.append((line, str(error)))
         for line, why in _contradictions(out.rows):
             out.refused.append((line, why))
-        gone = {line for line, _ in out.refused}
-        out.rows[:] = [r for r in out.rows if r.line not in gone]
+        refused = {line for line, _ in out.refused}
+        out.rows[:] = [r for r in out.rows if r.line not in refused]
         out.refused.sort()
         if not out.rows:
             text = "; ".join(f"line {line}: {why}" for line, why in out.refused[:5])

@@ -335,9 +335,9 @@ class Submap:
         P = position_covariances(self.exit_pose[None], self.exit_covariance[None])[:, :2, :2]
         s = np.sqrt(np.diag(self.exit_covariance))
         metres, radians = (s[:2], s[2:]) if d == 2 else (s[3:], s[:3])
-        lm, sure = self.landmarks, f"σ at most {metres.max():.3g} m and {np.degrees(radians.max()):.3g}°"
+        lm, sigmas = self.landmarks, f"σ at most {metres.max():.3g} m and {np.degrees(radians.max()):.3g}°"
         n = 0 if lm is None else len(lm)
-        summary = f": end pose {sure}; {n} landmarks, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s"
+        summary = f": end pose {sigmas}; {n} landmarks, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s"
         path = np.stack([np.zeros(d), self.exit_pose[:d]]) if self.trajectory is None else self.trajectory.positions
         ellipses = [(self.exit_pose[None, :2], P)]
         if lm is not None and d == 2 and n:

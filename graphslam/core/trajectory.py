@@ -104,8 +104,8 @@ class Trajectory:
 
     def __repr__(self) -> str:
         when = f", {self.times[0]:.6g} to {self.times[-1]:.6g} s" if len(self) else ""
-        sure = "" if self.covariances is None else ", with covariances"
-        return f"Trajectory({len(self)} poses in {'the plane' if self.poses.shape[1] == 3 else 'space'}{when}{sure})"
+        note = "" if self.covariances is None else ", with covariances"
+        return f"Trajectory({len(self)} poses in {'the plane' if self.poses.shape[1] == 3 else 'space'}{when}{note})"
 
     @property
     def dim(self) -> int:

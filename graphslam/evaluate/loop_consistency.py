@@ -120,8 +120,8 @@ def find_landmark_loops(
     own_noise: list[Array] = []
     skipped = 0
     pairs = _sharing_pairs(maps, min_shared, min_gap)
-    taken = pairs[:: -(-len(pairs) // max_loops)] if pairs else []
-    for a, b in taken:
+    tested = pairs[:: -(-len(pairs) // max_loops)] if pairs else []
+    for a, b in tested:
         common = [i for i in row_of[a] if i in row_of[b]]
         fit = chain.align(a, b, [row_of[a][i] for i in common], [row_of[b][i] for i in common])
         if fit is None:
@@ -159,7 +159,7 @@ def find_landmark_loops(
         shape_chi2=np.array([f[4] for f in found]),
         shape_dof=np.array([f[5] for f in found], dtype=np.int64),
         skipped=skipped,
-        left_out=len(pairs) - len(taken),
+        left_out=len(pairs) - len(tested),
     )
 
 

@@ -178,9 +178,9 @@ def find_overlap(pieces: GridPieces) -> str | None:
     if np.any(pieces.cubes & ((1 << shifts) - 1)[:, None]):
         return "a cube does not begin at a multiple of its edge"
     for shift in np.unique(shifts).tolist():
-        taken = pieces.cubes[shifts == shift] >> shift
+        larger = pieces.cubes[shifts == shift] >> shift
         smaller = np.concatenate([pieces.bricks, pieces.cubes[shifts < shift]]) >> shift
-        if np.isin(_pack(smaller + (1 << 18)), _pack(taken + (1 << 18))).any():
+        if np.isin(_pack(smaller + (1 << 18)), _pack(larger + (1 << 18))).any():
             return "a cube overlaps another piece"
     return None
 

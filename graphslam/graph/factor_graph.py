@@ -190,11 +190,11 @@ class FactorGraph(FactorGraphState):
         ids = np.array(landmark_ids if landmark_ids is not None else lm.ids, dtype=np.int64)
         if ids.shape != (n,):
             raise GeometryError(f"landmark ids of submap {submap.key} do not fit", got=ids.shape, wanted=(n,))
-        gone = [int(i) for i in ids if int(i) in self._retired]
-        if np.any(ids < -1) or gone:
+        retired = [int(i) for i in ids if int(i) in self._retired]
+        if np.any(ids < -1) or retired:
             raise DataError(
                 f"landmark ids of submap {submap.key} are not usable",
-                got=f"merged-away ids {gone}" if gone else int(ids.min()),
+                got=f"merged-away ids {retired}" if retired else int(ids.min()),
                 wanted="-1 for new, or an id of the graph or a fresh one",
             )
         record: SubmapRecord | SpaceSubmapRecord

@@ -204,7 +204,7 @@ def thin_candidates(
     score: Array,
     stretch: float,
     keep: int,
-    taken: Sequence[tuple[int, float]] = (),
+    earlier: Sequence[tuple[int, float]] = (),
 ) -> list[int]:
     """Best pairs, best first, with at most one place per stretch for each target submap.
 
@@ -219,11 +219,11 @@ def thin_candidates(
         [m]
     keep : int
         Largest number of pairs.
-    taken : sequence of (int, float)
+    earlier : sequence of (int, float)
         Target and path length of pairs that were used before.
     """
     left = np.ones(len(score), bool)
-    for m, w in taken:
+    for m, w in earlier:
         left &= (target != m) | (np.abs(way - w) >= stretch)
     out: list[int] = []
     for k in np.argsort(-score, kind="stable").tolist():

@@ -199,8 +199,8 @@ def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "event
 
 def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> LoopDecision | None:
     """Decision on a front-end match that became a factor, or did not; None for other events."""
-    taken = e.get("event") == "between" and e.get("group") == "match"
-    if not taken and e.get("event") != "match-not-used":
+    used = e.get("event") == "between" and e.get("group") == "match"
+    if not used and e.get("event") != "match-not-used":
         return None
 
     def figure(name: str) -> float:
@@ -208,15 +208,15 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Loo
         return math.nan if value is None else float(value)
 
     fid = int(e.get("factor_id", -1))
-    gone = taken and fid in removed
-    if gone and removed[fid] == DECIDED:
+    undone = used and fid in removed
+    if undone and removed[fid] == DECIDED:
         return None  # it is in the ledger as a loop
     support = figure("support")
-    why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
+    why = f"removed: {removed[fid]}" if undone else f"support {support:.2f}"
     return LoopDecision(
         loop=number,
-        verdict="undone" if gone else "accepted" if taken else "rejected",
-        why=why if taken else f"{why} is too little",
+        verdict="undone" if undone else "accepted" if used else "rejected",
+        why=why if used else f"{why} is too little",
         i=int(e.get("i", -1)),
         j=int(e.get("j", -1)),
         submap_i=int(e.get("target", -1)),
@@ -224,8 +224,8 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Loo
         source=FRONT_END,
         score=support,
         gates={"fitness": figure("fitness")},
-        weight=math.nan if taken and not gone else 0.0,
-        factor_id=-1 if gone or not taken else fid,
+        weight=math.nan if used and not undone else 0.0,
+        factor_id=-1 if undone or not used else fid,
     )
 
 

@@ -173,8 +173,8 @@ class LoopCloser:
             if self._disputes():
                 self._reconsider()
                 if self.map_check is not None:
-                    settled = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
-                    self._round([], settled)
+                    resolved = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
+                    self._round([], resolved)
                     self._reconsider()
         self._report_weights()
 
@@ -381,7 +381,7 @@ class LoopCloser:
     def _reconsider(self) -> set[int]:
         """Switch off loops that the rest of the graph contradicts, worst first; returns their numbers."""
         limit = chi2_quantile(self.config.off, self._dof)
-        gone: set[int] = set()
+        removed: set[int] = set()
         while inside := self.accepted:
             alone = self.without(inside)
             worst = int(np.argmax(alone))
@@ -389,8 +389,8 @@ class LoopCloser:
                 break
             n = inside[worst]
             self.switch_off(n, f"the graph without it: χ² {alone[worst]:.1f} > {limit:.1f}", float(alone[worst]))
-            gone.add(n)
-        return gone
+            removed.add(n)
+        return removed
 
     def _report_weights(self) -> None:
         """Write the weights of the kernels, which have changed since loops were accepted."""

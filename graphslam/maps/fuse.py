@@ -238,45 +238,45 @@ class FusedMap:
         limit = self.tolerance if tolerance is None else float(tolerance)
         if not limit >= 0:
             raise ConfigError(f"tolerance of a move is {tolerance} voxels; wanted ≥ 0")
-        gone = list(dict.fromkeys(remove))
-        self._check(add, gone, poses)
+        removed = list(dict.fromkeys(remove))
+        self._check(add, removed, poses)
         wanted = dict(zip(poses, self._checked(poses)))
         movers = [name for name in wanted if name not in add]
         moved = self._beyond(movers, wanted, limit)
         self._make_room(add, wanted)
         with self._grid.pool.lock:
             fresh = self._pose({**{n: self._pieces[n] for n in moved}, **add}, wanted)
-            old = [self._posed[name] for name in (*gone, *moved)]
-            left = set(gone)
+            old = [self._posed[name] for name in (*removed, *moved)]
+            left = set(removed)
             posed = {n: p for n, p in self._posed.items() if n not in left} | fresh
             keys = np.unique(np.concatenate([_NONE, *(p.keys for p in (*old, *fresh.values()))]))
             work, written, empty = self._grid.copy(), [_NONE], 0  # the grid itself changes at the end
-            for some, values, gone_empty in self._posers[0].sums(
+            for some, values, emptied in self._posers[0].sums(
                 keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
             ):
                 if len(some):
                     write_packed(work, some, values)
                 written.append(some)
-                empty += gone_empty
+                empty += emptied
             changed = np.concatenate(written)
             with defer_interrupts():
                 self._grid.replace_contents(work)
                 self._posed = posed
-                for name in gone:
+                for name in removed:
                     del self._pieces[name], self._wanted[name]
                 self._pieces |= add
                 self._wanted |= wanted
                 self._uncounted.append(changed)
         self._tidy(empty)
-        return MapChange(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(changed))
+        return MapChange(len(add), len(removed), len(moved), len(movers) - len(moved), len(keys), len(changed))
 
     # --- inside ----------------------------------------------------------------------------------------------
 
-    def _check(self, add: Mapping[PieceId, Piece], gone: list[PieceId], poses: Mapping[PieceId, Any]) -> None:
-        for name in gone:
+    def _check(self, add: Mapping[PieceId, Piece], removed: list[PieceId], poses: Mapping[PieceId, Any]) -> None:
+        for name in removed:
             if name not in self._pieces:
                 raise DataError(f"there is no piece {name!r} in this map", wanted="the name of a piece")
-        left = self._pieces.keys() - set(gone)
+        left = self._pieces.keys() - set(removed)
         for name, piece in add.items():
             if name in left:
                 raise DataError(f"piece {name!r} is in this map already", wanted="another name, or remove it as well")

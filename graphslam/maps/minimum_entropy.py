@@ -169,8 +169,8 @@ def _follow(
         piece = next(iter(c.pieces.values()))
         fused = FusedMap(piece.voxel_size, dim=piece.dim, model=model)
     here = fused.pieces
-    gone = [n for n, p in here.items() if c.pieces.get(n) is not p]
+    removed = [n for n, p in here.items() if c.pieces.get(n) is not p]
     new = {n: p for n, p in c.pieces.items() if n not in here or here[n] is not p}
-    change = fused.update(add=new, remove=gone, poses=poses, tolerance=0.0)
+    change = fused.update(add=new, remove=removed, poses=poses, tolerance=0.0)
     work += [change.added + change.removed + change.moved, change.summed]
     return fused

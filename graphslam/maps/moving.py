@@ -163,19 +163,19 @@ def static_submaps(submaps: Sequence[Submap], bases: Array) -> tuple[list[Submap
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
     """Submaps with clouds and grids rebuilt without dynamic points; the others are unchanged."""
     out = []
-    for s, gone in zip(submaps, moving):
+    for s, drop in zip(submaps, moving):
         cloud, grid = s.cloud, s.grid
-        if not gone.any() or cloud is None or cloud.scan is None or not isinstance(grid, EvidenceGrid):
+        if not drop.any() or cloud is None or cloud.scan is None or not isinstance(grid, EvidenceGrid):
             out.append(s)
             continue
         assert cloud.origins is not None
-        left = CloudMap(points=cloud.points[~gone], origins=cloud.origins, scan=cloud.scan[~gone], cell=cloud.cell)
+        left = CloudMap(points=cloud.points[~drop], origins=cloud.origins, scan=cloud.scan[~drop], cell=cloud.cell)
         drawn = grid.empty(GridPool(grid.pool.levels))
         for k, origin in enumerate(cloud.origins):
-            points = cloud.points[(cloud.scan == k) & ~gone]
+            points = cloud.points[(cloud.scan == k) & ~drop]
             if len(points):
                 drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
-        out.append(replace(s, cloud=left, grid=spill_grid(drawn), report={**s.report, "points_moved": int(gone.sum())}))
+        out.append(replace(s, cloud=left, grid=spill_grid(drawn), report={**s.report, "points_moved": int(drop.sum())}))
     return out
 
 

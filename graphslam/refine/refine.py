@@ -207,20 +207,20 @@ class _Refiner:
 
     def run(self) -> Refinement:
         """All rounds; repeated from the odometry's path if the initial path is wrong."""
-        guides, taken = self.neighbours_and_guides()
+        guides, used = self.neighbours_and_guides()
         self.all_passes(DISTANCES)
         other = None
         assert self.surfaces is not None
         odometry = self.odometry_path()
         self.reckoned = self.agreement_along(odometry)
-        contradicted = np.any(~taken & guides.far(self.poses))
+        contradicted = np.any(~used & guides.far(self.poses))
         if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
             why = "the start contradicts the scans between" if contradicted else "the odometry alone agrees better"
             self.tell(f"{why}: once more from the odometry")
             other = self.from_odometry()
-            taken = taken & (not other.taken)
+            used = used & (not other.taken)
             self.reckoned = self.agreement_along(odometry)
-        found = self.result(guides.steps[~taken & guides.far(self.poses)], other)
+        found = self.result(guides.steps[~used & guides.far(self.poses)], other)
         if not found.input_better or self.fixes is not None:  # fixes constrain the path, and the odometry has none
             return found
         self.tell("the odometry alone agrees better; its path is the result")
@@ -237,8 +237,8 @@ class _Refiner:
         check = ScanCheck(shares[-1], shares[0], np.zeros((0, 2), np.int64))
         if check.contradicted or not len(self.find_guides()):
             return check
-        guides, taken = self.neighbours_and_guides()
-        return replace(check, refused=guides.steps[~taken & guides.far(self.poses)])
+        guides, used = self.neighbours_and_guides()
+        return replace(check, refused=guides.steps[~used & guides.far(self.poses)])
 
     def odometry_path(self) -> Array:
         """Poses of the odometry alone, from the first pose of the initial path."""
@@ -408,20 +408,20 @@ class _Refiner:
         assert self.surfaces is not None
         r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         information = point_information(self.found, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
-        taken = np.zeros(len(guides), bool)
+        used = np.zeros(len(guides), bool)
         solved: LinearisedProblem | None = None
         for _ in range(MOST_GATES):
-            for _ in range(1 + 2 * int(taken.any())):
+            for _ in range(1 + 2 * int(used.any())):
                 solved = None  # see `round`
-                w = np.where(taken, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
+                w = np.where(used, (ACCEPTED / (guides.squared(self.poses) + ACCEPTED)) ** 2, 0.0)
                 solved = self.step(information, [guides.terms(self.poses, w)])
             assert solved is not None
             fits = guides.distances(self.poses, solved, self.group.dof) < ACCEPTED
-            if np.array_equal(fits, taken):
+            if np.array_equal(fits, used):
                 break
-            taken = fits
-        self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
-        return guides, taken
+            used = fits
+        self.tell(f"{len(guides)} guides, {int(used.sum())} of them agree with the scans between")
+        return guides, used
 
     def pairs(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array) -> tuple[SurfacePairs, Array]:
         """Pairs found at a path with surfaces made there, and their residuals [m].

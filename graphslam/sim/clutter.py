@@ -59,11 +59,11 @@ def park_cars(
     """
     count = 0
     for x, y, yaw in bays:
-        taken, du, dv, turn, length, width, height, reverse = rng.random(8)
+        chance, du, dv, turn, length, width, height, reverse = rng.random(8)
         size = (3.7 + 1.0 * length, 1.65 + 0.2 * width, 1.35 + 0.45 * height)
         heading = yaw + np.deg2rad(4.0) * (turn - 0.5) + (np.pi if reverse < 0.5 else 0.0)
         centre = (x + 0.3 * (du - 0.5), y + 0.5 * (dv - 0.5))
-        if taken < occupied and clear.allows(centre, size[:2], heading, floor):
+        if chance < occupied and clear.allows(centre, size[:2], heading, floor):
             mesh.car(centre, heading, floor, size)
             count += 1
     return count

@@ -244,12 +244,12 @@ def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
     seconds : sequence of float
         Of each tile.
     """
-    out, begin, taken = [], 0, 0.0
+    out, begin, total = [], 0, 0.0
     for k, s in enumerate(seconds):
-        taken += s
-        if taken >= least:
+        total += s
+        if total >= least:
             out.append(slice(begin, k + 1))
-            begin, taken = k + 1, 0.0
+            begin, total = k + 1, 0.0
     if begin < len(seconds):  # the rest is added to the last task
         first = out.pop().start if out else 0
         out.append(slice(first, len(seconds)))

@@ -133,8 +133,8 @@ def descend_to_minimum(
             return end(found.decrement, "rejected")
         # damped steps: the objective always decreases; then Gauss-Newton again
         before = objective
-        values, taken, steps = problem.damped(values, objective, budget - used)
-        history += taken
+        values, costs, steps = problem.damped(values, objective, budget - used)
+        history += costs
         objective = history[-1]
         used += max(steps, 1)
         if _hopeless(history, best_known, used):

@@ -158,19 +158,19 @@ class Isam2Solver:
         self._read = 0
 
     def _update(self) -> None:
-        new, gone = self._difference()
-        changed = [i for i in gone if i in self.graph.records]  # re-keyed by a merge
-        lost = self._known - set(self.graph.structure.layout().names()) if gone else set()
+        new, removed = self._difference()
+        changed = [i for i in removed if i in self.graph.records]  # re-keyed by a merge
+        lost = self._known - set(self.graph.structure.layout().names()) if removed else set()
         if changed or lost:
-            self._rebuild(new, gone)
-        elif new or gone or not self.updates:
+            self._rebuild(new, removed)
+        elif new or removed or not self.updates:
             self._check_fresh(new)
             try:
-                self._feed(new, gone)
+                self._feed(new, removed)
                 self._promise(new)
             except _FAILURES as error:
                 # the complete graph may still be solvable: a factor is rejected only if that fails, too
-                self._rebuild(new, gone, cause=error)
+                self._rebuild(new, removed, cause=error)
             else:
                 self.updates += 1
         self._read = len(self.graph.records.journal)
@@ -183,16 +183,16 @@ class Isam2Solver:
 
     def _difference(self) -> tuple[list[FactorRecord], list[int]]:
         """Records to add, and ids of factors that were removed or changed in the graph."""
-        records, new, gone = self.graph.records, [], []
+        records, new, removed = self.graph.records, [], []
         for i in dict.fromkeys(self.graph.records.journal[self._read :]):
             now, held = records.get(i), self._held.get(i)
             if held is not None and held[0] is not now:
-                gone.append(i)
+                removed.append(i)
             if now is not None and (held is None or held[0] is not now):
                 new.append(now)
-        return new, gone
+        return new, removed
 
-    def _feed(self, new: list[FactorRecord], gone: list[int]) -> None:
+    def _feed(self, new: list[FactorRecord], removed: list[int]) -> None:
         """One update of GTSAM."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fresh: dict[str, None] = {}
@@ -203,13 +203,13 @@ class Isam2Solver:
                     fresh[name] = None
         insert_values(values, fresh, self.graph.structure, self.graph.landmark_rows)
         parameters = gtsam.ISAM2UpdateParams()
-        parameters.removeFactorIndices = [self._held[i][1] for i in gone]
+        parameters.removeFactorIndices = [self._held[i][1] for i in removed]
         loops = (isinstance(r, BetweenRecord) and fresh.keys().isdisjoint(r.variables()) for r in new)
         parameters.force_relinearize = any(loops)
         if self._isam is None:
             self._isam = self._new()
         slots = list(self._isam.update(factors, values, parameters).getNewFactorsIndices())
-        for i in gone:
+        for i in removed:
             del self._held[i]
         for record, slot in zip(new, slots):
             self._held[record.factor_id] = (record, slot)
@@ -259,7 +259,7 @@ class Isam2Solver:
             raise SolverError("iSAM2 returned values that are not finite")
         return estimate
 
-    def _rebuild(self, new: list[FactorRecord], gone: list[int], cause: Exception | None = None) -> None:
+    def _rebuild(self, new: list[FactorRecord], removed: list[int], cause: Exception | None = None) -> None:
         """Rebuild iSAM2 from the graph's records, linearised at the graph's values.
 
         ``cause``: the error of the incremental update.
@@ -280,7 +280,7 @@ class Isam2Solver:
                 self._check_normal_equations()
             self.graph.set_values(self.pull(self.graph.values))
         except _FAILURES as error:
-            self._blame(new, gone, cause or error)
+            self._blame(new, removed, cause or error)
         self._read = len(self.graph.records.journal)
         self.rebuilds += 1
         self.updates += 1
@@ -300,9 +300,9 @@ class Isam2Solver:
         if not np.all(np.isfinite(A.data if sp.issparse(A) else A)):
             raise SolverError("the squares of its Jacobian overflow")
 
-    def _blame(self, new: list[FactorRecord], gone: list[int], error: Exception) -> None:
+    def _blame(self, new: list[FactorRecord], removed: list[int], error: Exception) -> None:
         """Find out why the whole graph fails, and raise a specific error."""
-        if gone:
+        if removed:
             self._forget()
             self.graph.diagnose().raise_if_bad()
         # the first new factor with which an update of those before it fails

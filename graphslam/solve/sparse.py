@@ -206,7 +206,7 @@ class SparseProblem:
         LM converges from far away. In a curved valley (large heading errors) it is slow, because one damping applies to
         all directions; trust-region steps keep their full length along the valley.
         """
-        taken: list[float] = []
+        costs: list[float] = []
         damping, steps = 1e-6, 0
         for _ in range(min(10, budget)):
             H, b = self._system(values)
@@ -225,17 +225,17 @@ class SparseProblem:
             steps += 1
             small = objective - now < LITTLE * objective
             values, objective, damping = moved, now, damping / 10.0
-            taken.append(now)
+            costs.append(now)
             if small:
                 break
         if self.thorough and steps < budget:
             values, more = self._in_trust_region(values, objective, min(20, budget - steps))
-            taken, steps = taken + more, steps + len(more)
-        return values, taken, steps
+            costs, steps = costs + more, steps + len(more)
+        return values, costs, steps
 
     def _in_trust_region(self, values: Values, objective: float, budget: int) -> tuple[Values, list[float]]:
         """Powell's dog leg: the full step, bent towards steepest descent at the radius."""
-        taken: list[float] = []
+        costs: list[float] = []
         radius = FIRST_RADIUS
         for _ in range(budget):
             try:
@@ -258,10 +258,10 @@ class SparseProblem:
                 break
             small = objective - now < RELATIVE * objective
             values, objective = moved, now
-            taken.append(now)
+            costs.append(now)
             if small:
                 break
-        return values, taken
+        return values, costs
 
 
 def _dog_leg(steepest: Array, full: Array, radius: float) -> Array:

@@ -158,7 +158,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     H, nu, rows, last = _linearise_pairings(x, obs, sensor, pair_o, pair_k, count)
     used = np.zeros(last + 1, np.bool_)
     L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
-    choice, taken = np.empty(levels + 1, np.int64), np.full(levels + 1, -1)
+    choice, chosen = np.empty(levels + 1, np.int64), np.full(levels + 1, -1)
     paired, depth, D2 = np.zeros(levels + 1, np.int64), np.zeros(levels + 1, np.int64), np.zeros(levels + 1)
     best_n, best_d2 = 0, np.inf
     nodes = 0
@@ -172,10 +172,10 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
             best_match[:] = match
         if level == levels or hopeless or choice[level] > end[level]:
             level -= 1
-            if level >= 0 and taken[level] >= 0:  # undo the pairing of this branch
-                used[pair_k[taken[level]]] = False
-                match[pair_o[taken[level]]] = -1
-                taken[level] = -1
+            if level >= 0 and chosen[level] >= 0:  # undo the pairing of this branch
+                used[pair_k[chosen[level]]] = False
+                match[pair_o[chosen[level]]] = -1
+                chosen[level] = -1
             continue
         i = choice[level]
         choice[level] += 1
@@ -190,7 +190,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
             # rows of the joint covariance with every earlier pairing, then with itself
             at = 0
             for v in range(level):
-                p = taken[v]
+                p = chosen[v]
                 if p < 0:
                     continue
                 cp = 3 + 2 * pair_k[p]
@@ -217,7 +217,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
                 d2 += y[d + r] ** 2
             if d2 > gates[d + rows[i]]:
                 continue
-            taken[level] = i
+            chosen[level] = i
             used[pair_k[i]] = True
             match[pair_o[i]] = pair_k[i]
             paired[level + 1], depth[level + 1], D2[level + 1] = paired[level] + 1, d + rows[i], d2

@@ -152,14 +152,14 @@ class RbpfEkf(FrontEnd):
         problem = self._problem(data, association, rows, span)
         smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
         if not data.has_bearing.all():
-            settled = resolve_mirror_ambiguity(problem, smoothed, DELAYED)
-            smoothed = settled.smoothed
+            resolved = resolve_mirror_ambiguity(problem, smoothed, DELAYED)
+            smoothed = resolved.smoothed
             report |= {
                 "beacons_without_landmark": len(particles.waiting.slots),
                 "ranges_unspent": len(particles.waiting) + particles.waiting.unspent,
-                "mirrors_swapped": settled.swapped,
-                "ambiguous_landmarks": settled.ambiguous,
-                "vague_landmarks": settled.vague,
+                "mirrors_swapped": resolved.swapped,
+                "ambiguous_landmarks": resolved.ambiguous,
+                "vague_landmarks": resolved.vague,
             }
         slot_of = association.slots[smoothed.landmark_kept]
         made = particle_gaussians(filters, association, smoothed, inflate=c.moment_inflation)

@@ -311,8 +311,8 @@ class LidarOdometry:
             predicted = bridge
         motion = np.asarray(se3.se3_between(before, predicted))
         self._doubt(raw, points, motion, even, dt, fit, seen, self._instead(seen, motion, Q))
-        sure = fit is not None and not seen.unobservable and not self.lost and seen.state in MAPPED
-        if sure and reckoned is not None and self.reckoned is not None:
+        reliable = fit is not None and not seen.unobservable and not self.lost and seen.state in MAPPED
+        if reliable and reckoned is not None and self.reckoned is not None:
             made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
             self.reckoned.learn(reckoned[0], made, guess)
         if self.inertial is not None and seen.state in MAPPED:

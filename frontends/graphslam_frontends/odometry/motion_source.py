@@ -139,8 +139,8 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
     whole = chain_odometry(odometry) if config.yaw_bias else upright
 
     def solve(times: Array, _: Array, drops: DropCounter | None) -> MotionPrior:
-        sure, gaps = bridge_gap(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
-        cut = cut_odometry(sure, times, config.controls)
+        bridged, gaps = bridge_gap(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
+        cut = cut_odometry(bridged, times, config.controls)
         poses = whole.interpolate(times)
         motion = MotionPrior(odometry=cut, poses=poses, path=whole, biases=_biases(cut, config), gaps=gaps)
         if not config.odometry_tilt_sigma:

@@ -169,15 +169,13 @@ class SegmentMaps:
             self.scans[a] |= self.scans[b]
         return self._move(table, b, a, T_a_b)
 
-    def _move(self, table: SegmentTable, gone: int, to: int, T_to_gone: Array) -> int:
-        moved = np.flatnonzero((table.map == gone) & table.alive)
+    def _move(self, table: SegmentTable, old: int, to: int, T_to_old: Array) -> int:
+        moved = np.flatnonzero((table.map == old) & table.alive)
         table.map[moved] = to
-        table.T_map[moved] = self.group.compose(
-            np.broadcast_to(T_to_gone, table.T_map[moved].shape), table.T_map[moved]
-        )
+        table.T_map[moved] = self.group.compose(np.broadcast_to(T_to_old, table.T_map[moved].shape), table.T_map[moved])
         self.users[to] += len(moved)
-        self.entered[to] += self.entered[gone]
-        if self.locked[gone] and not self.locked[to]:
+        self.entered[to] += self.entered[old]
+        if self.locked[old] and not self.locked[to]:
             self.lock(to)
-        self.drop(gone, len(moved))
+        self.drop(old, len(moved))
         return to

@@ -71,8 +71,8 @@ def localise_command(
     from graphslam.app.sessions.localise import localise as find
     from graphslam.app.sessions.localise import source_of
 
-    taken = source_of(source, submap, begin, end, reader=reader, reader_options=reader_options(reader_option))
-    found = find(run, taken, progress=not as_json)
+    query = source_of(source, submap, begin, end, reader=reader, reader_options=reader_options(reader_option))
+    found = find(run, query, progress=not as_json)
     rows = found.rows()
     columns = ["submap_map", "submap_here", "score", "accepted", "why"]
     text = f"{text_table(rows, columns)}\n{found!r}"

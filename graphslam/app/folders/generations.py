@@ -212,11 +212,11 @@ def _commit(home: Path, staged: Path, names: list[str]) -> None:
 def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
     """Without links: replace file by file, ``run.json`` or ``merge.json`` last; the ids inside reveal mixed states."""
     last = [n for n in names if n in ("run.json", "merge.json")]
-    gone = set(_names(home, everything=False)) - set(names)
+    obsolete = set(_names(home, everything=False)) - set(names)
     for name in [*(n for n in names if n not in last), *last]:
         (home / name).parent.mkdir(parents=True, exist_ok=True)
         (staged / name).replace(home / name)
-    for name in gone:
+    for name in obsolete:
         (home / name).unlink(missing_ok=True)
     shutil.rmtree(staged.parent, ignore_errors=True)
     sync_to_disk(home)

@@ -210,12 +210,12 @@ def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
 
 def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Findings on the constant errors that were estimated with the map."""
-    sure = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
-    wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
+    significant = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
+    wild = [r for r in significant if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
     if not facts:
         return []
-    estimates = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
-    rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
+    estimates = [estimate_text(r["name"], r["value"], r["sigma"]) for r in significant]
+    rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in significant]
     text = f"systematic errors estimated with the map: {'; '.join(estimates) or 'none significant'}"
     text += f" — not significant: {', '.join(rest)}." if rest else "."
     text += " The covariances include their uncertainty."

@@ -48,8 +48,8 @@ def redo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
         if d.verdict != "undone":
             raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
         entry = (d.submap_i, d.submap_j)
-        gone = [x for x in undone if x.loop != loop]
-        return [x for x in gone if entry not in overlap_entries(x.gates)] if d.source == FRONT_END else gone
+        left = [x for x in undone if x.loop != loop]
+        return [x for x in left if entry not in overlap_entries(x.gates)] if d.source == FRONT_END else left
 
     return _again(folder, without, progress)
 

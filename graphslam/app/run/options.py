@@ -99,12 +99,12 @@ class RunOptions:
             frontend, why = choice.frontend, choice.why
         name = name_of(frontend)
         suggested = recommended_options(log, name, preset)
-        taken, for_this_set = preset_of(log, name)
+        found, for_this_set = preset_of(log, name)
         if read:
             names = name if isinstance(name, str) else ", ".join(name)
-            logger.warning("front end: %s (%s); preset: %s", names, why, preset or taken or "none")
+            logger.warning("front end: %s (%s); preset: %s", names, why, preset or found or "none")
         # noise and constants of another set's preset do not fit this log: they are estimated, unless that is off
-        own = bool(suggested) and (for_this_set if preset in (None, taken) else _estimates_nothing(asked))
+        own = bool(suggested) and (for_this_set if preset in (None, found) else _estimates_nothing(asked))
         if isinstance(frontend, FrontEnd) and not isinstance(frontend, type):
             suggested = {k: v for k, v in suggested.items() if k != "frontend"}
         if not (own and uses_preset_noise(asked)):

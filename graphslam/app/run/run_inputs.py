@@ -100,21 +100,21 @@ def collect_inputs(
     )
 
 
-def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
+def write_inputs(folder: Path, inputs: RunInputs, generation: str) -> None:
     """Write the inputs into the folder of a run's files."""
-    log = taken.log
+    log = inputs.log
     save_log(replace(log, streams={n: s for n, s in log.streams.items() if _is_kept(s)}), folder / INPUTS)
     arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
     for k, stream in enumerate(log.streams.values()):
         if not _is_kept(stream):
             arrays[f"times_{k}"] = stream.times
-    rows = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in taken.noticed]
+    rows = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in inputs.noticed]
     arrays["noticed"] = np.array(rows, "U").reshape(-1, 4)
-    if taken.identities is not None:
-        arrays["identities"] = taken.identities
+    if inputs.identities is not None:
+        arrays["identities"] = inputs.identities
     write_npz(folder / "taken.npz", arrays)
-    if taken.scans is not None:
-        taken.scans.save(folder / SCANS)
+    if inputs.scans is not None:
+        inputs.scans.save(folder / SCANS)
 
 
 def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:

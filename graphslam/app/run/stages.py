@@ -268,9 +268,9 @@ def _fuse(made: SolvedMap, graph_map: GlobalMap) -> None:
             made.out.add(*row)
         made.seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
         made.seconds["total"] += made.seconds["map"]
-        gone, every = fused.moving
-        if gone:
-            text = f"moving objects: {gone} of {every} points ({gone / every:.1%}) — removed from the map."
+        removed, every = fused.moving
+        if removed:
+            text = f"moving objects: {removed} of {every} points ({removed / every:.1%}) — removed from the map."
             made.findings.append(Finding("", "moving", text))
 
 

@@ -87,8 +87,8 @@ class SubmapSlam:
         self.store = None
         if self.folder is not None:
             load = load_spilled if self.options.with_grids else None
-            settled = 0 if self.settled is None else self.settled.draw
-            self.store = self.folder.submaps_with(load, draw=None if draw == settled else draw)
+            chosen = 0 if self.settled is None else self.settled.draw
+            self.store = self.folder.submaps_with(load, draw=None if draw == chosen else draw)
         self.submaps: list[Submap] = [] if self.store is None else self.store.complete_prefix()
         if self.store is not None and self.options.front is not None:
             self.store.truncate(len(self.submaps))

@@ -210,8 +210,8 @@ def read_terrain(
         places = {k: MovedObjects(np.asarray(se3.se3_transform(turn, p))) for k, p in (moved or {}).items()}
         # a scan at the time of a node belongs to the submap that ends there
         ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
-        gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
-        turns = _Turns(scans, at, level, height, sensor_height is None, gone)
+        moving = [places.get(k) for k in np.maximum(ends, 0).tolist()]
+        turns = _Turns(scans, at, level, height, sensor_height is None, moving)
     for node in Bar(nodes.tolist(), name="terrain", unit="node", shown=progress):
         mine = at[owner == node]
         if turns is not None:
@@ -297,9 +297,9 @@ class _Turns:
         level: Trajectory,
         height: float,
         look: bool,
-        gone: Sequence[MovedObjects | None],
+        moving: Sequence[MovedObjects | None],
     ) -> None:
-        self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, gone
+        self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, moving
         self.coming = deque(at.tolist())
         self.read: dict[int, tuple[Array, Array]] = {}
         self.below: dict[int, float] = {}
@@ -320,9 +320,9 @@ class _Turns:
 
     def _decode(self, k: int) -> None:
         points, origin = _posed(self.scans, k, self.level)
-        gone = self.gone[self.place[k]]
-        if gone is not None:
-            moved = gone.parts(points)
+        objects = self.gone[self.place[k]]
+        if objects is not None:
+            moved = objects.parts(points)
             points, self.left_out = points[~moved], self.left_out + int(np.count_nonzero(moved))
         self.read[k] = points, origin
         if self.look and self.place[k] % _LOOK == 0:

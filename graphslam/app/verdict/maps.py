@@ -61,8 +61,8 @@ def _attempts(rows: Any) -> list[Finding]:
         f"graphs tried: {len(rows)} {what} — contradicted voxels {', '.join(shares)}. Number {kept + 1} is the result"
         + ("; `graphslam loops` lists its loop closures." if rows[kept].get("loops") else ".")
     )
-    settled = isinstance(share := rows[kept].get("share"), float) and share <= LOOK
-    return [Finding("" if settled else "look", "passes-attempts", text)]
+    clear = isinstance(share := rows[kept].get("share"), float) and share <= LOOK
+    return [Finding("" if clear else "look", "passes-attempts", text)]
 
 
 def check_two_maps(figures: RunMetrics) -> list[Finding]:

@@ -103,10 +103,10 @@ def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
 def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Lines from events of the graph: outliers, GPS errors, options without effect, beacons without position."""
     out = []
-    taken = Counter(str(e["group"]) for e in events if e.get("event") == "outlier")
-    if taken:
-        counts = ", ".join(f"{n} of class {group}" for group, n in sorted(taken.items()))
-        text = f"outliers: {taken.total()} factors ({counts}) — removed by graduated non-convexity; see events."
+    outliers = Counter(str(e["group"]) for e in events if e.get("event") == "outlier")
+    if outliers:
+        counts = ", ".join(f"{n} of class {group}" for group, n in sorted(outliers.items()))
+        text = f"outliers: {outliers.total()} factors ({counts}) — removed by graduated non-convexity; see events."
         out.append(Finding("look", "outliers", text))
     out += [_fix_errors(e) for e in events if e.get("event") == "gps-errors"]
     for e in events:

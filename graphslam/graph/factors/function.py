@@ -152,6 +152,6 @@ register_factor(FunctionBatch)
 
 def check_group(group: str) -> None:
     """A class of its own: the degrees of freedom of variables are counted by the classes of the package."""
-    taken = {c for kind in KINDS.values() for c in kind.classes}
-    if not group or group in taken:
+    known = {c for kind in KINDS.values() for c in kind.classes}
+    if not group or group in known:
         raise ConfigError(f"factors of the package have the group {group!r}; choose another name")

@@ -228,10 +228,10 @@ class ControlFactors(SensorFactors):
         self._take_out(lambda r: any(k is not None and k not in known for k in _rows(r, "landmark")))
         self.gps.remove_unused(removed)
 
-    def _take_out(self, gone: Any) -> None:
+    def _take_out(self, removed: Any) -> None:
         g = self.graph
         for fid, r in list(g.records.single.items()):
-            if isinstance(r, (ControlRecord, DistanceRecord)) and gone(r):
+            if isinstance(r, (ControlRecord, DistanceRecord)) and removed(r):
                 g.take_out(fid, "its place was removed")
 
 

@@ -434,8 +434,8 @@ class GpsFactors(SensorFactors):
         if inner.factor_id is not None:
             del g.records[inner.factor_id]
             g.ledger.release(inner.factor_id)
-        gone = set(inner.rows.values())
-        kept = [k for k in range(g.structure.count("point")) if k not in gone]
+        removed = set(inner.rows.values())
+        kept = [k for k in range(g.structure.count("point")) if k not in removed]
         new = {old: k for k, old in enumerate(kept)}
         for fid, r in list(g.records.items()):
             if isinstance(r, PathRecord):

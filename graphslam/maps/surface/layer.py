@@ -95,10 +95,10 @@ class SurfaceLayer:
         beams = c.carve_beams if c.carving else 1 << 40
         figures = (round(FULL * c.enough), beams, c.carve_ratio)
         make_target(rows, self._sums, figures, self._target, self._known)
-        gone = self._pieces_in[rows] == 0
+        empty = self._pieces_in[rows] == 0
         reached = _around(changed, c.halo)
-        if np.any(gone):
-            self._drop(changed[gone])
+        if np.any(empty):
+            self._drop(changed[empty])
         anew = reached[self._find(reached) >= 0]
         inputs = _around(anew, c.halo)
         inputs = inputs[self._find(inputs) >= 0]

@@ -213,9 +213,9 @@ def _add(made: Pyramid, piece: TerrainPiece, T: Array, sign: int) -> None:
         jx = np.floor((c * x + s * y) / width).astype(np.int64) - first[0]
         jy = np.floor((-s * x + c * y) / width).astype(np.int64) - first[1]
         inside = (jx >= 0) & (jy >= 0) & (jx < shape[0]) & (jy < shape[1])
-        taken = np.where(inside, table[np.clip(jy, 0, shape[1] - 1), np.clip(jx, 0, shape[0] - 1)], -1)
-        iy, ix = np.nonzero(taken >= 0)
-        source = taken[iy, ix]
+        target = np.where(inside, table[np.clip(jy, 0, shape[1] - 1), np.clip(jx, 0, shape[0] - 1)], -1)
+        iy, ix = np.nonzero(target >= 0)
+        source = target[iy, ix]
         cell = made.offsets[b] + (iy + iy0 - made.first[b, 1]) * made.shapes[b, 1] + (ix + ix0 - made.first[b, 0])
         made.ratios[:, cell] += sign * piece.ratios[:, source]
         made.counts[:, cell] += sign * piece.counts[:, source]

@@ -151,8 +151,8 @@ def truncated_least_squares(
     # one limit for all, the smallest: false loops widen the estimated tail
     limit = np.min([f.limit for _, f in found], axis=0)
     reached: dict[str, float] = {}
-    for name, settled in found:
-        cost = truncated_cost(flat, settled.end.values, limit)
+    for name, descent in found:
+        cost = truncated_cost(flat, descent.end.values, limit)
         reached[name] = min(cost, reached.get(name, np.inf))
     name, best = min(found, key=lambda f: reached[f[0]])
     final = _trim(network, flat, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)

@@ -88,11 +88,11 @@ def moving_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
     met = met[~standing.occupied_at(met)]
     known = np.asarray(standing.occupied_cloud())
     centres, moved = seen_through_voxels(whole, make.moments(log))
-    taken = {tuple(k) for k in np.floor(centres[moved] / size).astype(np.int64).tolist()}
+    dynamic = {tuple(k) for k in np.floor(centres[moved] / size).astype(np.int64).tolist()}
 
     def left(points: Array) -> Array:
         cells = np.floor(points / size).astype(np.int64).tolist()
-        return whole.occupied_at(points) & ~np.array([tuple(k) in taken for k in cells], dtype=bool)
+        return whole.occupied_at(points) & ~np.array([tuple(k) in dynamic for k in cells], dtype=bool)
 
     for kind, there in (("evidence", whole.occupied_at), ("outvoted", left)):
         yield Measurement(kind, "gone", float(1.0 - np.mean(there(met))))

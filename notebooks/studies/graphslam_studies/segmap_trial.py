@@ -245,14 +245,14 @@ class GraphTrial(GridTrial):
         for s in graph.submaps:
             times[list(s.nodes)] = s.times
         truth = self._truth_at(times)
-        taken = set(closer.accepted)
+        accepted = set(closer.accepted)
         measured = {n: x for n, x in closer.loops.items() if not x.why}
         right = {n for n, x in measured.items() if is_right(x, truth)}
         yield Measurement(kind, "loops_tried", len(closer.loops))
         yield Measurement(kind, "loops_measured", len(measured))
         yield Measurement(kind, "loops_measured_right", len(right))
-        yield Measurement(kind, "loops_taken", len(taken))
-        yield Measurement(kind, "loops_taken_right", len(taken & right))
+        yield Measurement(kind, "loops_taken", len(accepted))
+        yield Measurement(kind, "loops_taken_right", len(accepted & right))
 
     def _truth_at(self, times: Array) -> Array:
         truth = Trajectory(self.steps.times, self.truth)

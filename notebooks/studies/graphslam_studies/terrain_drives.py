@@ -222,9 +222,9 @@ class Navigator:
 
     def _speed(self, way: Array, found: TerrainMap) -> float:
         """Speed limit [m/s]: detection range of falls, and stopping before unknown ground or possible falls."""
-        sure = found.known & ~found.provisional
-        sure = binary_closing(sure, np.ones((3, 3), np.bool_), border_value=0) | sure
-        room = distance_transform_edt(sure) * found.cell
+        confirmed = found.known & ~found.provisional
+        confirmed = binary_closing(confirmed, np.ones((3, 3), np.bool_), border_value=0) | confirmed
+        room = distance_transform_edt(confirmed) * found.cell
         at = np.floor((way - found.origin) / found.cell).astype(np.int64)
         open_ = room[at[:, 1], at[:, 0]] > 0.5 * self.config.trial.vehicle.width
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])

@@ -119,8 +119,8 @@ class SingleMapParticles(ParticleSet):
             out[rows] = self._slots[rows][:, row]
         particle = np.arange(len(self.pose))
         slot = np.maximum(out, 0)
-        gone = (self.hits[particle, slot] == 0) | (scan_of[:, None] < self.born[particle, slot])
-        out[gone] = IGNORED
+        unused = (self.hits[particle, slot] == 0) | (scan_of[:, None] < self.born[particle, slot])
+        out[unused] = IGNORED
         return out
 
     def features(self, min_hits: int) -> tuple[Ints, Ints]:

@@ -101,13 +101,13 @@ def measure_gps(
         return ornstein_uhlenbeck(tree.child(name).generator(), shape, 1.0, time, dt)
 
     # a satellite behind a wall is taken while a slow process is in its upper tail; its way is longer, never shorter
-    taken = correlated("taken", c.reflect_time) > _upper(drawn["hidden_share"])
+    reflected = correlated("taken", c.reflect_time) > _upper(drawn["hidden_share"])
     longer = drawn["hidden_way"] * 0.5 * (1.0 + correlated("way", c.reflect_time) ** 2)
     by_wall = drawn["reflect_sigma"] * np.exp(-wall / c.reflect_reach)[:, None]
     error = drawn["orbit_sigma"] * correlated("orbit", c.orbit_time) + by_wall * correlated("wall", c.reflect_time)
     error += drawn["code_sigma"] * tree.child("code").generator().standard_normal(shape)
     error += np.where(seen, 0.0, longer)
-    used = seen | (taken & (scale > 0.0))
+    used = seen | (reflected & (scale > 0.0))
 
     sigma = float(np.hypot(drawn["orbit_sigma"], drawn["code_sigma"]))
     rows, found, stated = [], [], []

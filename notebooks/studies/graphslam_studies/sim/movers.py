@@ -53,9 +53,9 @@ class Mover:
         """Place in the plan ``(n, 2)`` and heading as a unit vector ``(n, 2)`` at times ``(n,)``."""
         leg = self.end - self.start
         length = float(np.linalg.norm(leg))
-        gone = np.mod(self.phase + self.speed * np.asarray(t, dtype=np.float64), 2.0 * length)
-        back = gone > length
-        along = np.where(back, 2.0 * length - gone, gone)
+        travelled = np.mod(self.phase + self.speed * np.asarray(t, dtype=np.float64), 2.0 * length)
+        back = travelled > length
+        along = np.where(back, 2.0 * length - travelled, travelled)
         u = leg / length
         return self.start + along[:, None] * u, np.where(back, -1.0, 1.0)[:, None] * u
 
