@@ -173,9 +173,9 @@ def compare_methods(
         EKF without refinement).
     """
     submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
-    way = methods_for(submaps)
+    available = methods_for(submaps)
     for m in methods:
-        way.check(m)
+        available.check(m)
     association = association_of(associate)
     if association is not None and isinstance(submaps, Sequence):
         submaps = identify_landmarks(submaps, association, progress=progress)
@@ -186,15 +186,15 @@ def compare_methods(
     for method in Bar(methods, name="compare", unit="method", shown=progress):
         own: dict[str, Any] = {}
         compile_method(submaps, method, polish=polish)
-        if method in way.joiners:
-            joined = way.joiners[method](submaps)
+        if method in available.joiners:
+            joined = available.joiners[method](submaps)
             if polish:
                 own = _judge(joined, keys, truth)
-            estimate: MapEstimate = way.polish(submaps, joined) if polish else joined
+            estimate: MapEstimate = available.polish(submaps, joined) if polish else joined
         else:
-            estimate = way.solvers[method](submaps, polish=polish, progress=False)
+            estimate = available.solvers[method](submaps, polish=polish, progress=False)
             if polish and truth is not None:
-                own = _judge(way.solvers[method](submaps, polish=False, progress=False), keys, truth)
+                own = _judge(available.solvers[method](submaps, polish=False, progress=False), keys, truth)
         rows.append(
             {
                 **_describe(method, submaps, estimate),

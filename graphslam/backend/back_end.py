@@ -301,8 +301,8 @@ class BackEnd:
         why = {d.loop: "asked for"}
         if d.source == FRONT_END:
             entry = (d.submap_i, d.submap_j)
-            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in overlap_entries(x.gates))
-            why |= {x.loop: f"by loop {loop}, which was undone" for x in ties}
+            dependent = (x for x in ledger.current() if x.verdict == "accepted" and entry in overlap_entries(x.gates))
+            why |= {x.loop: f"by loop {loop}, which was undone" for x in dependent}
         for number, reason in why.items():
             x = ledger.of(number)
             matched = self.graph.records[x.factor_id]

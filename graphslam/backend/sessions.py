@@ -206,12 +206,12 @@ def connect_session(
     if found is None:
         two = TwoSessions(known.map, new.map)
         found = two, two.find(c, progress=progress)
-    two, ties = found
-    if ties.why:
-        raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
-    start = session_start(ties.chosen, graph.values.poses[known_node:], new.chain)
+    two, loops = found
+    if loops.why:
+        raise DataError(f"no tie to {known.name}: {loops.why}", where=new.name)
+    start = session_start(loops.chosen, graph.values.poses[known_node:], new.chain)
     node = add_session(graph, new, start)
-    apart = two.thinned(ties.chosen, CandidateConfig().stretch)
+    apart = two.thinned(loops.chosen, CandidateConfig().stretch)
     here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
     factors = {_add(graph, x, known, new): x for x in here}
     solver.solve_to_optimum()
@@ -232,7 +232,7 @@ def connect_session(
     solver.solve_to_optimum()
     dropped += _winnow(graph, solver, factors)
     logger.info("%s is attached to %s by %d loop closures", new.name, known.name, len(factors))
-    return ConnectedSession(node, known, ties, list(factors.values()), dropped)
+    return ConnectedSession(node, known, loops, list(factors.values()), dropped)
 
 
 def connect_by_gps(
@@ -301,7 +301,7 @@ def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int
 
 
 def _near(
-    graph: FactorGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
+    graph: FactorGraph, two: TwoSessions, known_node: int, node: int, known: Sequence[Loop], progress: bool
 ) -> tuple[list[Loop], int]:
     """Loop closures between places of the two sessions that are near each other now, and the number of candidates.
 
@@ -310,7 +310,7 @@ def _near(
     shift = np.where(np.arange(len(two.places)) < len(two.known.places), known_node, node - two.offset)
     places = replace(two.places, node=(two.places.node + shift).astype(np.int64))
     row: dict[int, int] = {int(n): k for k, n in enumerate(places.node)}
-    before = [(row[x.i], row[x.j]) for x in tied if x.i in row and x.j in row]
+    before = [(row[x.i], row[x.j]) for x in known if x.i in row and x.j in row]
     config = CandidateConfig(least_gain=0.0, keep=40)
     found = proximity_candidates(places, GraphRelativePoses(graph), config, exclude=two.within, tried=before)
     measured = [x for x in two.measurer.measure(found, progress=progress) if not x.why]

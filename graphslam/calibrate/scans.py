@@ -98,12 +98,12 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     xi = g.log(o.increments)
     turns = xi[:, g.heading]
     seen = np.diff(steps.offsets) >= LEAST_POINTS
-    keys, way, turned = [], np.inf, np.inf
+    keys, length, turned = [], np.inf, np.inf
     for k in range(len(steps)):
-        way, turned = way + d[k], turned + abs(turns[k])
-        if seen[k] and (way > KEY[0] or turned > KEY[1]):
+        length, turned = length + d[k], turned + abs(turns[k])
+        if seen[k] and (length > KEY[0] or turned > KEY[1]):
             keys.append(k)
-            way = turned = 0.0
+            length = turned = 0.0
     dt = np.concatenate([[0.0], np.diff(steps.times)])[: len(steps)]
     moving = (d > 0.005 * np.maximum(dt, 1e-9)) | (np.abs(turns) > 0.005 * np.maximum(dt, 1e-9))
     variances = np.diagonal(o.covariances, axis1=1, axis2=2)

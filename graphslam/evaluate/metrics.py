@@ -374,16 +374,16 @@ def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
 
 def _contradiction(graph: FactorGraph) -> None:
     """Log a warning if the χ² of the preintegrated IMU factors exceeds the upper bound at 99.9 % (two-sided)."""
-    ways = class_consistency(graph).get("imu") if ImuFactors.of(graph).used else None
-    if ways is None or not np.isfinite(ways.ratio):
+    test = class_consistency(graph).get("imu") if ImuFactors.of(graph).used else None
+    if test is None or not np.isfinite(test.ratio):
         return
-    high = two_sided_bounds(ways.ratio, ways.dof, 0.999)[1]
-    if ways.ratio > high:
-        graph.log_event("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
+    high = two_sided_bounds(test.ratio, test.dof, 0.999)[1]
+    if test.ratio > high:
+        graph.log_event("imu-contradicted", chi2_per_dof=test.ratio, high=high)
         logger.warning(
             "submaps and IMU contradict each other: χ²/dof %.1f [≤ %.1f]; the assumed noise of one of them is too "
             "small",
-            ways.ratio,
+            test.ratio,
             high,
         )
 

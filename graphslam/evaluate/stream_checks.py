@@ -98,9 +98,9 @@ def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding
     odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
     moved = float("nan")
     if odometry is not None:
-        way = np.linalg.norm(odometry.increments[1:, : group_of(odometry.increments).dim], axis=1)
+        lengths = np.linalg.norm(odometry.increments[1:, : group_of(odometry.increments).dim], axis=1)
         period = min(float(np.median(np.diff(clouds.times))), 0.1)
-        moved = float(np.percentile(way / np.diff(odometry.times), 75)) * period
+        moved = float(np.percentile(lengths / np.diff(odometry.times), 75)) * period
     stuck = state == "constant"
     if not stuck and not moved > BENT:
         return []

@@ -58,9 +58,9 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
     path = _reckoned(log, t, gps.lever[:2])
     if path is None:
         return []
-    way = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
-    if way > MOVED and len(fixes) > 2 and bool(np.all(fixes == fixes[0])):
-        text = f"{name}: all {len(fixes)} fixes equal while the wheels drive {way:.0f} m — the receiver is stuck."
+    length = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    if length > MOVED and len(fixes) > 2 and bool(np.all(fixes == fixes[0])):
+        text = f"{name}: all {len(fixes)} fixes equal while the wheels drive {length:.0f} m — the receiver is stuck."
         return [Finding("bad", "gps-stuck", text)]
     return _chords(fixes, path, float(np.median(gps.sigma)), name, stream)
 

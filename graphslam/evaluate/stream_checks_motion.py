@@ -44,16 +44,16 @@ def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Findi
         return _too_fast(np.abs(motion.speed), np.abs(motion.yaw_rate), name)
     g = group_of(motion.increments)
     xi = np.asarray(g.log(motion.increments))[1:]
-    way, turn = np.linalg.norm(xi[:, g.position], axis=1), np.abs(xi[:, g.heading])
+    d, turn = np.linalg.norm(xi[:, g.position], axis=1), np.abs(xi[:, g.heading])
     # bursts of delayed records have stamps without use for speeds
     usual_steps = (dt > 0.5 * np.median(dt)) & (dt <= 5.0 * np.median(dt))
-    speed, rate = way / dt, turn / dt
+    speed, rate = d / dt, turn / dt
     out = _too_fast(speed[usual_steps], rate[usual_steps], name)
     usual = float(np.percentile(speed, 90)) if len(speed) else 0.0
-    k = np.flatnonzero((way > LEAP) & (speed > LEAP_TIMES * max(usual, 0.05)))
+    k = np.flatnonzero((d > LEAP) & (speed > LEAP_TIMES * max(usual, 0.05)))
     if len(k):
         text = (
-            f"jumps of {name}: {len(k)}, first {way[k[0]]:.1f} m in {dt[k[0]]:.2f} s at {motion.times[k[0] + 1]:.3f} s "
+            f"jumps of {name}: {len(k)}, first {d[k[0]]:.1f} m in {dt[k[0]]:.2f} s at {motion.times[k[0] + 1]:.3f} s "
             f"(record {k[0] + 1}; usual speed up to {usual:.2g} m/s) — the odometry was reset, or corrected by another "
             "map. Give the raw odometry, or cut the log."
         )

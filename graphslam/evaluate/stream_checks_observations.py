@@ -83,11 +83,11 @@ def _ranges_and_path(z: LandmarkObservations, name: str, log: SensorLog) -> list
     if pairs is None:
         return []
     first, second = pairs
-    way = _path_length(log, z.times)
-    if way is None:
+    lengths = _path_length(log, z.times)
+    if lengths is None:
         return []
     scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
-    moved = np.abs(way[scan[second]] - way[scan[first]])
+    moved = np.abs(lengths[scan[second]] - lengths[scan[first]])
     change = np.abs(z.ranges[second] - z.ranges[first])
     noise = 4.0 * np.sqrt(z.sigmas[first, 0] ** 2 + z.sigmas[second, 0] ** 2)
     if moved.sum() < LEAST_PATH:

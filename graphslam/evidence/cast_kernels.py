@@ -28,8 +28,8 @@ FLAT, NEVER = 1e-200, 1e300
 
 
 @kernel(error_model="numpy")
-def coordinate_after(o, d, inverse, first, t, tie):
-    """Voxel coordinate on one axis after the ray crossed all planes before ``t`` (with ``tie`` also those at ``t``).
+def coordinate_after(o, d, inverse, first, t, closed):
+    """Voxel coordinate on one axis after the ray crossed all planes before ``t`` (with ``closed`` also those at ``t``).
 
     ``first`` is the voxel coordinate of the origin ``o``; the result is never behind it.
     """
@@ -38,7 +38,7 @@ def coordinate_after(o, d, inverse, first, t, tie):
     if abs(f - p) > NEAR:
         return math.floor(f)
     at = (p - o) * inverse
-    behind = at < t or (tie and at == t)
+    behind = at < t or (closed and at == t)
     if d >= 0.0:
         k = p if behind else p - 1
         return max(k, first)

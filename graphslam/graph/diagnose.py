@@ -58,10 +58,10 @@ def unconnected_variables(flat: FactorArrays) -> tuple[list[str], int]:
     ground = lay.size
     prior = np.concatenate([np.zeros(0, dtype=bool), *(np.full(len(f), f.prior) for f in flat.batches)])
     at = np.where(variable < 0, ground, variable)
-    at, factor, tied = at[variable != -2], factor[variable != -2], prior
+    at, factor, priors = at[variable != -2], factor[variable != -2], prior
     # every factor is a node after the columns; a prior connects its variable to a known value
-    rows = np.concatenate([at, np.full(int(tied.sum()), ground)])
-    factors = ground + 1 + np.concatenate([factor, np.flatnonzero(tied)])
+    rows = np.concatenate([at, np.full(int(priors.sum()), ground)])
+    factors = ground + 1 + np.concatenate([factor, np.flatnonzero(priors)])
     size = ground + 1 + len(flat)
     links = sp.coo_matrix((np.ones(len(rows)), (rows, factors)), shape=(size, size))
     label = connected_components(links, directed=False)[1]

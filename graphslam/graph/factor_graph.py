@@ -90,8 +90,8 @@ class FactorGraph(FactorGraphState):
             f": χ² {score.total:.4g} at its values, for {score.dof} degrees of freedom; {len(x)} nodes, "
             f"{len(self.values.landmarks)} landmarks, {len(self.records)} factors"
         )
-        ties = [r for r in self.records.single.values() if isinstance(r, BetweenRecord)]
-        links = [(r.i, r.j) for r in ties if abs(r.i - r.j) > 1]
+        betweens = [r for r in self.records.single.values() if isinstance(r, BetweenRecord)]
+        links = [(r.i, r.j) for r in betweens if abs(r.i - r.j) > 1]
         links += [pair for b in self.records.blocks for pair in b.ends[b.kept & (np.ptp(b.ends, axis=1) > 1)].tolist()]
         ends = x[np.array(links, dtype=np.intp).reshape(-1, 2), :d]
         picture = plan_sketch([x[:, :d]], points=self.values.landmarks, links=ends)

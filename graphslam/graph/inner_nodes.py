@@ -55,11 +55,11 @@ def inner_rows(path: Trajectory, spacing: float) -> npt.NDArray[np.intp]:
     """Rows of a path about every ``spacing`` metres of path length, without its ends."""
     if len(path) < 3:
         return np.zeros(0, dtype=np.intp)
-    way = arc_length(path.positions)
-    pieces = round(way[-1] / spacing)
-    goals = way[-1] * np.arange(1, pieces) / max(pieces, 1)
-    after = np.clip(np.searchsorted(way, goals), 1, len(way) - 1)
-    rows = np.where(goals - way[after - 1] < way[after] - goals, after - 1, after)
+    along = arc_length(path.positions)
+    pieces = round(along[-1] / spacing)
+    goals = along[-1] * np.arange(1, pieces) / max(pieces, 1)
+    after = np.clip(np.searchsorted(along, goals), 1, len(along) - 1)
+    rows = np.where(goals - along[after - 1] < along[after] - goals, after - 1, after)
     rows = np.unique(rows)
     return np.asarray(rows[(rows > 0) & (rows < len(path) - 1)], dtype=np.intp)
 
@@ -84,8 +84,8 @@ def cut_submap(submap: Submap, spacing: float | None) -> SubmapChain:
     increments = group.between(T[:-1], T[1:])
     if len(rows) == 0 or path is None:
         return SubmapChain(times, T, submap.exit_pose[None].copy(), submap.exit_covariance[None].copy())
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(increments[:, : group.dim], axis=1))])
-    share = np.diff(way) / way[-1] if way[-1] > 0 else np.full(len(increments), 1.0 / len(increments))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(increments[:, : group.dim], axis=1))])
+    share = np.diff(along) / along[-1] if along[-1] > 0 else np.full(len(increments), 1.0 / len(increments))
     if path.covariances is None:
         Q = share[:, None, None] * np.diag(np.diag(submap.exit_covariance))
     else:

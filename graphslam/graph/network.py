@@ -53,8 +53,8 @@ def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordere
         free = np.setdiff1d(np.arange(n + l), network.anchors)
         at[free] = np.arange(len(free))
         i, j = at[np.concatenate([edges, seen + [0, n]])].T
-        tied = (i >= 0) & (j >= 0)
-        order = free[elimination_order(i[tied], j[tied], len(free))] if len(free) else free
+        free_pair = (i >= 0) & (j >= 0)
+        order = free[elimination_order(i[free_pair], j[free_pair], len(free))] if len(free) else free
     layout = VariableLayout(network.dim, counts, network.landmark_ids, fixed, order)
     batches: list[FactorBatch] = [
         BetweenBatch.of_arrays(edges, network.measurements[e], whiteners(network.information[e]), layout)

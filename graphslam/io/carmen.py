@@ -197,8 +197,8 @@ def usual_stamps(times: Array, poses: Array) -> Array | None:
     step = se2_between(poses[:-1], poses[1:])
     metres, radians, seconds = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]), np.diff(times)
     n = min(TOGETHER, len(seconds))
-    way, turn, time = (np.convolve(v, np.ones(n), "valid") if n else v for v in (metres, radians, seconds))
-    if not n or np.mean((way > IMPOSSIBLE[0] * time) | (turn > IMPOSSIBLE[1] * time)) < 0.5:
+    length, turn, time = (np.convolve(v, np.ones(n), "valid") if n else v for v in (metres, radians, seconds))
+    if not n or np.mean((length > IMPOSSIBLE[0] * time) | (turn > IMPOSSIBLE[1] * time)) < 0.5:
         return None
     spent = np.maximum(np.maximum(metres / USUAL_MOTION[0], radians / USUAL_MOTION[1]), USUAL_MOTION[2])
     spent = np.minimum(spent, 3.0 * np.median(spent))  # a large step between two scans is no gap in the records

@@ -116,9 +116,9 @@ class FrameTree:
             carried, behind = self._reached(key[1]), self._reached(key[0])
             bases = {f for f in carried if leaf(f) in BASE_FRAMES}
             if parent is None and not known:
-                way = float(np.ptp(np.array(rows.values)[:, :3], axis=0).max())
+                extent = float(np.ptp(np.array(rows.values)[:, :3], axis=0).max())
                 based = any(leaf(f) in BASE_FRAMES for f in behind)
-                if based or way < LEAST_PATH or not (bases or scanners & carried.keys()):
+                if based or extent < LEAST_PATH or not (bases or scanners & carried.keys()):
                     continue
             found.append((known, leaf(key[0]) not in MAP_FRAMES, len(rows.values), key))
         return max(found)[3] if found else None

@@ -116,14 +116,14 @@ def _covariance(c: AppearanceConfig, dim: int) -> Array:
     return np.diag([tilt**2, tilt**2, c.angle**2, c.sigma**2, c.sigma**2, c.height**2])
 
 
-def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int]:
+def _stretches(along: Array, score: Array, stretch: float, count: int) -> list[int]:
     """Indices of the best ``score``, one per stretch."""
-    left = np.ones(len(way), bool)
+    left = np.ones(len(along), bool)
     out: list[int] = []
     for k in np.argsort(-score, kind="stable").tolist():
         if left[k]:
             out.append(k)
-            left &= np.abs(way - way[k]) >= stretch
+            left &= np.abs(along - along[k]) >= stretch
         if len(out) == count:
             break
     return out

@@ -200,7 +200,7 @@ def proximity_candidates(
 
 def thin_candidates(
     target: Ints,
-    way: Array,
+    along: Array,
     score: Array,
     stretch: float,
     keep: int,
@@ -212,7 +212,7 @@ def thin_candidates(
     ----------
     target : (m,) int
         Target submap of each pair.
-    way : (m,)
+    along : (m,)
         Path length at the source place [m].
     score : (m,)
     stretch : float
@@ -224,14 +224,14 @@ def thin_candidates(
     """
     left = np.ones(len(score), bool)
     for m, w in earlier:
-        left &= (target != m) | (np.abs(way - w) >= stretch)
+        left &= (target != m) | (np.abs(along - w) >= stretch)
     out: list[int] = []
     for k in np.argsort(-score, kind="stable").tolist():
         if len(out) == keep:
             break
         if left[k]:
             out.append(k)
-            left &= (target != target[k]) | (np.abs(way - way[k]) >= stretch)
+            left &= (target != target[k]) | (np.abs(along - along[k]) >= stretch)
     return out
 
 

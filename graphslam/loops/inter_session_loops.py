@@ -92,7 +92,7 @@ class SessionMap:
         if not submaps:
             raise DataError("a session without submaps cannot be placed", wanted="at least one submap")
         self.submaps = list(submaps)
-        nodes, which, poses, way, times, steps, covariances = [], [], [], [], [], [], []
+        nodes, which, poses, path_lengths, times, steps, covariances = [], [], [], [], [], [], []
         node, begin = 0, 0.0
         for k, s in enumerate(self.submaps):
             if s.landmarks is not None or not has_dense_view(s) or s.trajectory is None or not len(s.trajectory):
@@ -105,7 +105,7 @@ class SessionMap:
             which.append(np.full(n, k))
             poses.append(cut.T_base_node[:-1])
             times.append(cut.times[:-1])
-            way.append(begin + np.interp(cut.times[:-1], path.times, along))
+            path_lengths.append(begin + np.interp(cut.times[:-1], path.times, along))
             steps.append(cut.increments)
             covariances.append(cut.covariances)
             node, begin = node + n, begin + float(along[-1])
@@ -113,7 +113,7 @@ class SessionMap:
             np.concatenate(nodes).astype(np.int64),
             np.concatenate(which).astype(np.int64),
             np.concatenate(poses),
-            np.concatenate(way),
+            np.concatenate(path_lengths),
             np.concatenate(times),
         )
         self.increments, self.covariances = np.concatenate(steps), np.concatenate(covariances)
@@ -266,8 +266,8 @@ class TwoSessions:
             others = np.flatnonzero(~best.accepted)
             if len(others):
                 rival = int(largest_consistent_set(D[np.ix_(others, others)], limit, against_chain=False).clique.sum())
-            way = self.new.places.way[self._rows([x for x, yes in zip(loops, accepted) if yes])]
-            reach = float(np.ptp(way))
+            along = self.new.places.way[self._rows([x for x, yes in zip(loops, accepted) if yes])]
+            reach = float(np.ptp(along))
         n = int(accepted.sum())
         counts = f"{len(loops)} places looked alike, {len(good)} of them passed the registration, {n} agree"
         if n < config.least:
@@ -297,8 +297,8 @@ class TwoSessions:
         if not loops:
             return []
         target = self.known.places.submap[[x.i for x in loops]]
-        way = self.new.places.way[[x.j for x in loops]]
-        chosen = thin_candidates(target, way, np.array([x.score for x in loops]), stretch, len(loops))
+        along = self.new.places.way[[x.j for x in loops]]
+        chosen = thin_candidates(target, along, np.array([x.score for x in loops]), stretch, len(loops))
         return [loops[k] for k in sorted(chosen)]
 
     def _rows(self, loops: Sequence[Loop]) -> Ints:
@@ -318,7 +318,7 @@ class TwoSessions:
         return D
 
 
-def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
+def session_start(loops: Sequence[Loop], known: Array, new: Array) -> Array:
     """Initial pose of a session in the map: the medoid of the poses from its loop closures.
 
     Parameters
@@ -334,6 +334,6 @@ def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
         From the loop closure with the smallest sum of distances to the others.
     """
     g = group_of(known)
-    starts = np.stack([g.compose(g.compose(known[x.i], x.T_ij), g.inverse(new[x.j])) for x in ties])
+    starts = np.stack([g.compose(g.compose(known[x.i], x.T_ij), g.inverse(new[x.j])) for x in loops])
     apart = np.linalg.norm(starts[:, None, : g.dim] - starts[None, :, : g.dim], axis=2)
     return np.asarray(starts[int(np.argmin(apart.sum(axis=1)))])

@@ -93,14 +93,14 @@ def overlap_candidates(
         mine = places.of_submap(k)
         last = -math.inf
         for j in mine[1:].tolist():  # the base is the place of the entry itself
-            way = float(places.way[j])
-            if way - max(last, float(places.way[mine[0]])) < c.spacing:
+            length = float(places.way[j])
+            if length - max(last, float(places.way[mine[0]])) < c.spacing:
                 continue
             found = _beside(places, j, seen[k], c)
             if found is None:
                 continue
             i, T, by = found
-            last = way
+            last = length
             out.append(
                 LoopCandidate(
                     i=i, j=j, source=TIE, T_ij=T, covariance=c.covariance(group_of(T)), gain=math.nan, score=1.0,

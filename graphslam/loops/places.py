@@ -99,13 +99,13 @@ def places_at_nodes(poses: Sequence[Array], times: Sequence[Array]) -> Places:
 
 def _places(stretches: Sequence[tuple[Array, Array, Array, float]]) -> Places:
     """Concatenate poses, path lengths from the base, and times of all submaps."""
-    poses, ways, times, lengths = zip(*stretches)
+    poses, distances, times, lengths = zip(*stretches)
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     counts = [len(T) for T in poses]
     return Places(
         np.arange(sum(counts), dtype=np.int64),
         np.repeat(np.arange(len(counts), dtype=np.int64), counts),
         np.concatenate(poses),
-        np.concatenate([b + w for b, w in zip(begin, ways)]),
+        np.concatenate([b + w for b, w in zip(begin, distances)]),
         np.concatenate(times),
     )

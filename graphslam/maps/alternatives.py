@@ -61,9 +61,9 @@ class Alternative:
     def ties(self) -> int:
         """Number of submap pairs with matches or loops; several constraints of one pair count once."""
         submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
-        tied = [r for r in self.graph.records.values() if r.group in CONSTRAINTS and isinstance(r, BetweenRecord)]
+        links = [r for r in self.graph.records.values() if r.group in CONSTRAINTS and isinstance(r, BetweenRecord)]
         last = len(self.graph.submaps) - 1  # the last exit has its own node
-        return len({frozenset((submap.get(r.i, last), submap.get(r.j, last))) for r in tied})
+        return len({frozenset((submap.get(r.i, last), submap.get(r.j, last))) for r in links})
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,12 +201,12 @@ def chi2_of(graph: FactorGraph) -> float:
     return score.total + bare - sum(score[g].chi2 for g in CONSTRAINTS if g in score)
 
 
-def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float:
+def noise_scale(counts: Sequence[int], fits: Sequence[tuple[float, int]]) -> float:
     """Common variance factor of the graphs, at least 1: the odometry chain of a recorded log can be overconfident.
 
     Parameters
     ----------
-    ties : sequence of int
+    counts : sequence of int
         Number of submap pairs with loop constraints, per alternative.
     fits : sequence of (float, int)
         χ² and degrees of freedom.
@@ -215,10 +215,10 @@ def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float
     scale is 1. Otherwise it is the least χ²/dof of the alternatives that keep :data:`KEPT` of the pairs: a false loop
     increases χ² only in the alternatives that contain it.
     """
-    most = max(ties)
+    most = max(counts)
     if most < MANY:
         return 1.0
-    return max(1.0, min(chi2 / dof for n, (chi2, dof) in zip(ties, fits) if n >= KEPT * most and dof > 0))
+    return max(1.0, min(chi2 / dof for n, (chi2, dof) in zip(counts, fits) if n >= KEPT * most and dof > 0))
 
 
 def _contradiction(j: ScoredMap) -> str:

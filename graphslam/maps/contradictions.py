@@ -124,11 +124,11 @@ def find_contradictions(
     sizes = np.array(
         [np.quantile(np.linalg.norm(c - m, axis=1), 0.9) if len(c) else 0 for c, m in zip(clouds, middles)]
     )
-    way = arc_length(nodes[:, : g.dim])
+    along = arc_length(nodes[:, : g.dim])
     found = []
     for i, j in product(range(len(some)), repeat=2):
         near = sizes[i] + sizes[j]
-        another = abs(i - j) > 1 and abs(way[i] - way[j]) > near
+        another = abs(i - j) > 1 and abs(along[i] - along[j]) > near
         if another and len(clouds[i]) and len(clouds[j]) and np.linalg.norm(centres[i] - centres[j]) < near:
             found.append((i, j))
     if len(found) > PAIRS:

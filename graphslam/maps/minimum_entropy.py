@@ -107,16 +107,16 @@ def rank_by_entropy(
     dim = next(iter(candidates[0].pieces.values())).dim
     size = next(iter(candidates[0].pieces.values())).voxel_size
     poses = [{n: checked_poses(c.poses[n], dim) for n in c.pieces} for c in candidates]
-    way = visiting_order([_signature(c, p) for c, p in zip(candidates, poses)])
+    sequence = visiting_order([_signature(c, p) for c, p in zip(candidates, poses)])
     stands = grid_placements(count, size, dim)
     entropies, volumes = np.zeros((len(candidates), count)), np.zeros((len(candidates), count))
     work = np.zeros((len(candidates), 2), np.int64)
     best: tuple[float, int] | None = None
     best_map: FusedMap | None = None
-    with Bar(total=count * len(way), name="entropy of candidates", unit="map", shown=progress) as bar:
+    with Bar(total=count * len(sequence), name="entropy of candidates", unit="map", shown=progress) as bar:
         for s, T in enumerate(stands):
             fused: FusedMap | None = None
-            for k in way:
+            for k in sequence:
                 fused = _follow(fused, candidates[k], _placed(poses[k], T, dim, count), model, work[k])
                 found = mean_map_entropy([fused])
                 entropies[k, s], volumes[k, s] = found.entropy, found.volume
@@ -143,12 +143,12 @@ def rank_by_entropy(
 def visiting_order(signatures: Sequence[frozenset[Any]]) -> list[int]:
     """Greedy order of sets: the next is always that with the fewest differences."""
     left = list(range(1, len(signatures)))
-    way = [0]
+    visited = [0]
     while left:
-        here = signatures[way[-1]]
-        way.append(min(left, key=lambda k: (len(here ^ signatures[k]), k)))
-        left.remove(way[-1])
-    return way
+        here = signatures[visited[-1]]
+        visited.append(min(left, key=lambda k: (len(here ^ signatures[k]), k)))
+        left.remove(visited[-1])
+    return visited
 
 
 def _signature(c: MapHypothesis, poses: Mapping[PieceId, Array]) -> frozenset[Any]:

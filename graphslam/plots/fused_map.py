@@ -45,9 +45,9 @@ def plot_storey(
         Ground-truth path in the same frame, drawn in the same way.
     """
     ax = plot_section(floor_plan(grid, low, high), ax, title=title or f"{low:.1f} to {high:.1f} m")
-    for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path")):
-        if way is not None:
-            p = way.positions
+    for track, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path")):
+        if track is not None:
+            p = track.positions
             here = (p[:, 2] > low - BELOW) & (p[:, 2] < high)
             line = np.where(here[:, None], p, np.nan)
             ax.plot(line[:, 0], line[:, 1], color=color, lw=0.9, label=label)
@@ -135,9 +135,9 @@ def plot_cut(
     ax.set_facecolor("0.72")
     if p.size:
         ax.imshow(p, cmap="gray_r", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest")
-    for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path, all of it")):
-        if way is not None:
-            q = way.positions
+    for track, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path, all of it")):
+        if track is not None:
+            q = track.positions
             ax.plot(q[:, 1 - axis], q[:, 2], color=color, lw=0.9, label=label)
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero((p >= 0.5).any(axis=1))  # the sky is known, too, but of no interest

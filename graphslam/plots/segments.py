@@ -72,8 +72,8 @@ def plot_segments(
                 mec="white", mew=0.5, zorder=4)  # fmt: skip
         ax.annotate(str(k) if labels is None else labels[k], (p[0, i], p[0, j]), xytext=(4, 4),
                     textcoords="offset points", fontsize="x-small", color=style.BLACK, zorder=6)  # fmt: skip
-    for k, tie in enumerate(ties):
-        here, there = np.asarray(tie.here), np.asarray(tie.there)
+    for k, match in enumerate(ties):
+        here, there = np.asarray(match.here), np.asarray(match.there)
         ax.plot([here[i], there[i]], [here[j], there[j]], color=style.BLACK, lw=1.2, marker="o", ms=5.0, mfc="none",
                 label=f"matches ({len(ties)})" if k == 0 else None, zorder=5)  # fmt: skip
     style.metric_axes(ax, *plane)

@@ -84,8 +84,8 @@ class FixModel:
         self.group, t, d = group_of(poses), motion.steps.times, group_of(poses).dim
         self.gravity, self.lever, self.robust = motion.gravity, gps.lever, config.robust
         k = np.clip(np.searchsorted(t, gps.times, side="right") - 1, 0, len(t) - 2)
-        way = np.linalg.norm(poses[k + 1, :d] - poses[k, :d], axis=1)
-        inside = np.flatnonzero((gps.times >= t[0]) & (gps.times <= t[-1]) & (way < FARTHEST))
+        length = np.linalg.norm(poses[k + 1, :d] - poses[k, :d], axis=1)
+        inside = np.flatnonzero((gps.times >= t[0]) & (gps.times <= t[-1]) & (length < FARTHEST))
         self.left = len(gps.times) - len(inside)
         self.k, self.times = k[inside], gps.times[inside]
         self.share = (self.times - t[self.k]) / np.maximum(t[self.k + 1] - t[self.k], 1e-12)

@@ -34,11 +34,11 @@ def find_nodes(steps: Scans, spacing: float, turn: float) -> Index:
     if g.dim == 3 or n < 3:
         return np.arange(n, dtype=np.int64)
     u = steps.odometry.increments
-    way, turned = np.cumsum(np.hypot(u[:, 0], u[:, 1])), np.cumsum(np.abs(u[:, 2]))
+    along, turned = np.cumsum(np.hypot(u[:, 0], u[:, 1])), np.cumsum(np.abs(u[:, 2]))
     seen = np.diff(steps.offsets) > 0
     nodes = [0]
     for k in range(1, n - 1):
-        if seen[k] and (way[k] - way[nodes[-1]] >= spacing or turned[k] - turned[nodes[-1]] >= turn):
+        if seen[k] and (along[k] - along[nodes[-1]] >= spacing or turned[k] - turned[nodes[-1]] >= turn):
             nodes.append(k)
     return np.array([*nodes, n - 1], np.int64)
 

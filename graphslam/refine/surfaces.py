@@ -71,12 +71,12 @@ class ScanReturns:
         n = len(steps)
         step = np.repeat(np.arange(n), np.diff(steps.offsets))
         hit = steps.returns
-        way, t = steps.path_length, steps.times
+        along, t = steps.path_length, steps.times
         turned = np.cumsum(np.abs(steps.group.log(steps.odometry.increments)[:, steps.group.heading]))
         chunk = np.zeros(n, np.int64)
         c, first = 0, 0
         for k in range(1, n):
-            longer = way[k] - way[first] > chunk_length or t[k] - t[first] > chunk_time
+            longer = along[k] - along[first] > chunk_length or t[k] - t[first] > chunk_time
             if longer or turned[k] - turned[first] > chunk_turn:
                 c, first = c + 1, k
             chunk[k] = c

@@ -25,8 +25,8 @@ class KeepClear:
         Free space on either side of the route's centre line [m].
     """
 
-    def __init__(self, way: Route | Array, margin: float = 1.2) -> None:
-        self._points = way.positions(way.every(0.25)) if isinstance(way, Route) else way
+    def __init__(self, path: Route | Array, margin: float = 1.2) -> None:
+        self._points = path.positions(path.every(0.25)) if isinstance(path, Route) else path
         self.margin = margin
 
     def distance(self, centre: Sequence[float], size: Sequence[float], yaw: float, floor: float) -> float:

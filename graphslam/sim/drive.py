@@ -84,15 +84,15 @@ def sample_route(route: Route) -> SampledRoute:
     )
 
 
-def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
+def smooth_route(route: SampledRoute, width: float) -> SampledRoute:
     """The same route without discontinuities of slope or curvature: everything is averaged over ``width`` metres.
 
     The pitch of a robot with a wheelbase changes gradually where the slope changes. The average is a triangle (two
     running means), so that pitch and yaw have a continuous rate.
     """
-    half = round(0.5 * width / way.step) // 2 * 2 + 1  # samples of one running mean, odd
+    half = round(0.5 * width / route.step) // 2 * 2 + 1  # samples of one running mean, odd
     if half < 3:
-        return way
+        return route
     pad = 2 * half
 
     def smooth(a: Array, *, straight: bool = False) -> Array:
@@ -106,11 +106,11 @@ def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
         return np.asarray(wide[pad:-pad], dtype=np.float64)
 
     return SampledRoute(
-        step=way.step,
-        positions=smooth(way.positions, straight=True),
-        yaw=smooth(way.yaw),
-        pitch=smooth(way.pitch),
-        roll=smooth(way.roll),
+        step=route.step,
+        positions=smooth(route.positions, straight=True),
+        yaw=smooth(route.yaw),
+        pitch=smooth(route.pitch),
+        roll=smooth(route.roll),
     )
 
 
@@ -125,25 +125,25 @@ class RouteMotion:
         Cruise [m/s].
     """
 
-    def __init__(self, way: SampledRoute, speed: float, config: DriveConfig) -> None:
+    def __init__(self, route: SampledRoute, speed: float, config: DriveConfig) -> None:
         if not (np.isfinite(speed) and speed > 0):
             raise DataError("speed is impossible", got=speed, wanted="> 0 m/s")
         self.config = config
-        self.length = float(np.sum(np.linalg.norm(np.diff(way.positions, axis=0), axis=1)))
-        u = np.arange(len(way.yaw)) * way.step
-        columns = np.column_stack([way.positions, way.yaw, way.pitch, way.roll])
+        self.length = float(np.sum(np.linalg.norm(np.diff(route.positions, axis=0), axis=1)))
+        u = np.arange(len(route.yaw)) * route.step
+        columns = np.column_stack([route.positions, route.yaw, route.pitch, route.roll])
         self._path: BSpline = make_interp_spline(u, columns, k=5)
         self._path1, self._path2 = self._path.derivative(1), self._path.derivative(2)
 
         # cruise time τ(u) = ∫ du / pace, the pace less than the speed where the route turns fast
         turning = np.abs(self._path1(u)[:, 3])
         pace = np.minimum(speed, config.most_turn_rate / np.maximum(turning, 1e-9))
-        window = max(round(1.0 / way.step), 1)
+        window = max(round(1.0 / route.step), 1)
         pace = minimum_filter1d(pace, window, mode="nearest")
         for _ in range(2):  # the running means stay within the widened minimum: never faster than allowed
             pace = uniform_filter1d(pace, max(window // 2, 1), mode="nearest")
         slowness = 1.0 / pace
-        tau = np.concatenate([[0.0], np.cumsum(0.5 * (slowness[1:] + slowness[:-1]) * way.step)])
+        tau = np.concatenate([[0.0], np.cumsum(0.5 * (slowness[1:] + slowness[:-1]) * route.step)])
         self._cruise = float(tau[-1])
         self._along: BSpline = make_interp_spline(tau, u, k=3)
         self._along1, self._along2 = self._along.derivative(1), self._along.derivative(2)
@@ -234,28 +234,28 @@ def euler_to_quat(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
     return quat_normalize(quat_multiply(quat_multiply(parts[0], parts[1]), parts[2]))
 
 
-def roll_by_floor(way: SampledRoute, caster: RayCaster, track: float) -> SampledRoute:
+def roll_by_floor(route: SampledRoute, caster: RayCaster, track: float) -> SampledRoute:
     """The route with the roll of the floor under the wheels of a robot ``track`` metres wide.
 
     Rays are cast downwards on either side of the route. Where one of them hits no floor near the height of the route,
     the roll is unchanged.
     """
-    left = np.column_stack([-np.sin(way.yaw), np.cos(way.yaw), np.zeros_like(way.yaw)])
+    left = np.column_stack([-np.sin(route.yaw), np.cos(route.yaw), np.zeros_like(route.yaw)])
     heights = []
     for side in (0.5, -0.5):
-        begin = way.positions + side * track * left + [0.0, 0.0, _FLOOR_ABOVE]
+        begin = route.positions + side * track * left + [0.0, 0.0, _FLOOR_ABOVE]
         rays = np.hstack([begin, np.broadcast_to([0.0, 0.0, -1.0], begin.shape)])
         heights.append(begin[:, 2] - caster.ranges(rays))
-    off = np.abs(np.array(heights) - way.positions[:, 2])
+    off = np.abs(np.array(heights) - route.positions[:, 2])
     seen = np.all(off < _FLOOR_OFF, axis=0)  # NaN, where no ray hit, is not less
     with np.errstate(invalid="ignore"):
-        roll = np.where(seen, np.arctan2(heights[0] - heights[1], track), way.roll)
-    return replace(way, roll=roll)
+        roll = np.where(seen, np.arctan2(heights[0] - heights[1], track), route.roll)
+    return replace(route, roll=roll)
 
 
 def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> RouteMotion:
     """The motion of a robot that drives through a world along its route; with a caster the roll follows the floor."""
-    way = sample_route(world.route())
+    route = sample_route(world.route())
     if caster is not None:
-        way = roll_by_floor(way, caster, config.track)
-    return RouteMotion(smooth_route(way, config.wheelbase), world.speed, config)
+        route = roll_by_floor(route, caster, config.track)
+    return RouteMotion(smooth_route(route, config.wheelbase), world.speed, config)

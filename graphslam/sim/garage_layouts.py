@@ -182,7 +182,7 @@ def drawn_layout(number: int) -> GarageLayout:
         end = found.waypoints()[-1][1]
         if not found.yard + CORNER_RADIUS + 1.0 < end < found.low_aisle:
             continue  # the route ends on its first straight
-        way = plan_route(np.array(found.waypoints()), CORNER_RADIUS, where=found.name)
+        route = plan_route(np.array(found.waypoints()), CORNER_RADIUS, where=found.name)
         pillars = np.array([(x, y) for x in found.columns for y in found.rows])
-        if float(cKDTree(pillars).query(way.positions(way.every(0.1))[:, :2])[0].min()) > ROOM:
+        if float(cKDTree(pillars).query(route.positions(route.every(0.1))[:, :2])[0].min()) > ROOM:
             return found

@@ -286,9 +286,9 @@ def _trees(route: Route, size: tuple[float, float], away: float, count: int, rng
     w, h = size
     tried = rng.uniform((-16.0, -4.0, 0.08), (w + 16.0, h + away + 6.0, 0.25), (20 * count, 3))
     off = np.maximum(np.maximum(-tried[:, :2], tried[:, :2] - [w, h]), 0.0)
-    to_way = cKDTree(route.positions(route.every(0.25))[:, :2]).query(tried[:, :2])[0]
+    to_route = cKDTree(route.positions(route.every(0.25))[:, :2]).query(tried[:, :2])[0]
     out = np.zeros((0, 3))
-    for trunk in tried[(np.hypot(off[:, 0], off[:, 1]) > 3.0) & (to_way > 1.5) & (to_way < 9.0)]:
+    for trunk in tried[(np.hypot(off[:, 0], off[:, 1]) > 3.0) & (to_route > 1.5) & (to_route < 9.0)]:
         if len(out) < count and np.all(np.hypot(*(out - trunk)[:, :2].T) > 3.0):
             out = np.vstack([out, trunk])
     return out
@@ -303,8 +303,8 @@ def _planar(motion: RouteMotion, times: Array) -> Array:
 def _wheels(times: Array, poses: Array, noise: Mapping[str, float], scale: float, seeds: SeedTree) -> Odometry:
     """Increments with noise that is independent from record to record."""
     exact = se2_between(poses[:-1], poses[1:])
-    way = np.hypot(exact[:, 0], exact[:, 1])
-    sigmas = np.hypot(np.sqrt(way)[:, None] * [noise["wheel"], noise["lateral"], noise["turn"]], _FLOOR)
+    length = np.hypot(exact[:, 0], exact[:, 1])
+    sigmas = np.hypot(np.sqrt(length)[:, None] * [noise["wheel"], noise["lateral"], noise["turn"]], _FLOOR)
     errors = scale * sigmas * seeds.generator().standard_normal(sigmas.shape)
     increments = np.vstack([np.zeros(3), se2_compose(exact, se2_exp(errors))])
     covariances = np.vstack([np.zeros((1, 3, 3)), sigmas[:, :, None] ** 2 * np.eye(3)])

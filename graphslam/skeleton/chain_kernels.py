@@ -179,10 +179,10 @@ def linearise_chain(chain, poses, span, blocks, diagonal, upper, g):
         g[k, 5] -= h[5]
         if not blocks:
             continue
-        turn, way = J[:3, :3], J[3:, 3:]
+        turn, shift = J[:3, :3], J[3:, 3:]
         _sandwich(turn, O[:3, :3], turn, M, 0, 0)
-        _sandwich(turn, O[:3, 3:], way, M, 0, 3)
-        _sandwich(way, O[3:, 3:], way, M, 3, 3)
+        _sandwich(turn, O[:3, 3:], shift, M, 0, 3)
+        _sandwich(shift, O[3:, 3:], shift, M, 3, 3)
         for i in range(3):
             for j in range(3):
                 M[3 + i, j] = M[j, 3 + i]

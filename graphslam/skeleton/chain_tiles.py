@@ -78,7 +78,7 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     sweep_parts(out)
     R, p = np.eye(3), np.zeros(3)
-    tiles, ties, begin = [], [], 0
+    tiles, between_tiles, begin = [], [], 0
     for piece in pieces:
         n = len(piece.translation) + 1
         end = begin + n - 1
@@ -92,7 +92,7 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
         inner = (ends >= begin).all(axis=1)
         arrays = {name: getattr(checked, name) for name in ("rotation", "translation", "covariance")}
         arrays |= {name: loops[name][inner] for name in _LOOPS} | {"ends": ends[inner] - begin}
-        ties.append({name: loops[name][~inner] for name in _LOOPS})
+        between_tiles.append({name: loops[name][~inner] for name in _LOOPS})
         here = Poses(np.empty((n, 3, 3)), np.empty((n, 3)))
         here.rotation[0], here.position[0] = R, p
         chains.compose_odometry(checked.rotation, checked.translation, here.rotation, here.position)
@@ -100,7 +100,7 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
         start = store_arrays(out, {"rotation": here.rotation, "position": here.position})
         tiles.append({"file": store_arrays(out, arrays), "poses": start, "begin": begin, "end": end})
         begin = end
-    between = store_arrays(out, {name: np.concatenate([t[name] for t in ties]) for name in ties[0]})
+    between = store_arrays(out, {name: np.concatenate([t[name] for t in between_tiles]) for name in between_tiles[0]})
     write_json(out / _INDEX, {"format": FORMAT, "ties": between, "tiles": tiles})
     return out
 
@@ -397,8 +397,8 @@ class _Together(NamedTuple):
 class _Separator:
     """Poses shared by tiles, and ends of loops between tiles."""
 
-    def __init__(self, ties: dict[str, npt.NDArray[Any]], spans: list[tuple[int, int]]) -> None:
-        ends = ties["ends"].astype(np.int64).reshape(-1, 2)
+    def __init__(self, raw: dict[str, npt.NDArray[Any]], spans: list[tuple[int, int]]) -> None:
+        ends = raw["ends"].astype(np.int64).reshape(-1, 2)
         cuts = np.array([a for a, _ in spans] + [spans[-1][1]], dtype=np.int64)
         nodes = np.unique(np.concatenate([cuts, ends.ravel()]))
         if nodes[0] < cuts[0] or nodes[-1] > cuts[-1] or (np.diff(cuts) < 1).any():
@@ -407,10 +407,10 @@ class _Separator:
         self.rows = [tuple(np.searchsorted(nodes, [a, b]) + [0, 1]) for a, b in spans]
         self.stay = [nodes[lo:hi] - a for (lo, hi), (a, _) in zip(self.rows, spans)]
         self._ends = np.searchsorted(nodes, ends).astype(np.int64)
-        covariance = ties["loop_covariance"].reshape(-1, 6, 6)
+        covariance = raw["loop_covariance"].reshape(-1, 6, 6)
         info = inverse_covariance(covariance, "loop_covariance") if len(covariance) else covariance
         first = np.arange(len(ends) + 1)
-        self._links = SegmentLinks(self._ends, first, ties["loop_rotation"], ties["loop_translation"], covariance, info)
+        self._links = SegmentLinks(self._ends, first, raw["loop_rotation"], raw["loop_translation"], covariance, info)
         self._pattern: KeyframePattern | None = None
 
     def gather(self, folder: Path, done: list[TaskResult]) -> _Together:

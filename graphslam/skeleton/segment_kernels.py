@@ -39,10 +39,10 @@ class SegmentLinks(NamedTuple):
 
 
 @njit(nogil=True, error_model="numpy")
-def _residual(links, e, turns, way, scratch, r):
-    """Write the residual (6,) of link e between two rotations, p_j - p_i = ``way`` in the world."""
+def _residual(links, e, turns, shift, scratch, r):
+    """Write the residual (6,) of link e between two rotations, p_j - p_i = ``shift`` in the world."""
     Ra, Rb = turns
-    dx, dy, dz = way
+    dx, dy, dz = shift
     A, E = scratch
     Z = _nine(links.rotation, e)
     # E = Zᵀ Raᵀ Rb
@@ -114,8 +114,8 @@ def join_links(links, poses, covariance, misfit):
         for e in range(links.first[s], links.first[s + 1]):
             i, j = links.ends[e, 0], links.ends[e, 1]
             Ra, Rb = _nine(P, i), _nine(P, j)
-            way = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
-            _residual(links, e, (Ra, Rb), way, (A, X), r)
+            shift = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
+            _residual(links, e, (Ra, Rb), shift, (A, X), r)
             k = 0 if single else e
             for m in range(6):
                 f[m] = 0.0

@@ -96,8 +96,8 @@ def forward_pass(
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
     seen, D, b = np.full(L, -1, dtype=np.int32), problem.room((L, 6)), problem.room((L, 3))
     rules = (int(ago), TURN_SIGMA**-2, DISTANCE_SIGMA**-2, GATE)
-    tied = refused = 0
+    aligned = refused = 0
     for span in problem.chunks(0, N):
         t, r = forward_pass_kernel(problem.observations_of(*span), chain, span, rules, seen, D, b, out)
-        tied, refused = tied + int(t), refused + int(r)
-    return ForwardPass(out, tied, refused)
+        aligned, refused = aligned + int(t), refused + int(r)
+    return ForwardPass(out, aligned, refused)

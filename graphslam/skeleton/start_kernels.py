@@ -33,7 +33,7 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
     tied, refused : int
         Number of poses aligned with old landmarks; number of rejected observations of old landmarks.
     """
-    ago, turn, way, gate = rules
+    ago, turn, shift, gate = rules
     rotation, position, points = chain_poses.rotation, chain_poses.position, detections.points
     A = np.empty((6, 6))
     x = np.empty(6)
@@ -49,7 +49,7 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
     misfit = np.empty(most)
     which = np.empty(most, np.int64)
     believed = np.ones(most, np.bool_)
-    tied = refused = 0
+    aligned = refused = 0
     for i in range(span[0], span[1]):
         R, p = out.rotation[i], out.position[i]
         if i == 0:
@@ -89,7 +89,7 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
             which[n] = m - lo
             n += 1
         if n >= 3:
-            tied += 1
+            aligned += 1
             Rp[:] = R
             pp[:] = p
             limit = np.inf
@@ -98,8 +98,8 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
                 x[:] = 0.0
                 for k in range(3):  # prior: rotation and translation from the prediction
                     A[k, k] = turn
-                    A[3 + k, 3 + k] = way
-                    x[3 + k] = -way * (p[k] - pp[k])
+                    A[3 + k, 3 + k] = shift
+                    x[3 + k] = -shift * (p[k] - pp[k])
                 for r in range(3):
                     for k in range(3):
                         E[r, k] = R[r, 0] * Rp[k, 0] + R[r, 1] * Rp[k, 1] + R[r, 2] * Rp[k, 2]
@@ -179,7 +179,7 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
             b[j, 2] += al * az + d * sz
             if start_seen[j] < 0:
                 start_seen[j] = i
-    return tied, refused
+    return aligned, refused
 
 
 @njit(nogil=True)

@@ -271,9 +271,9 @@ def _dog_leg(steepest: Array, full: Array, radius: float) -> Array:
     length = float(np.linalg.norm(steepest))
     if length >= radius:
         return steepest * (radius / length)
-    way = full - steepest
-    a, half, c = float(way @ way), float(steepest @ way), length**2 - radius**2
-    return np.asarray(steepest + (np.sqrt(half**2 - a * c) - half) / a * way)
+    leg = full - steepest
+    a, half, c = float(leg @ leg), float(steepest @ leg), length**2 - radius**2
+    return np.asarray(steepest + (np.sqrt(half**2 - a * c) - half) / a * leg)
 
 
 def _dense_solve(H: Array, b: Array) -> Array:

@@ -198,10 +198,10 @@ def interpolate_covariances(knots: npt.NDArray[np.int64], covariances: Array, po
     n = len(poses)
     R = _axes(poses)
     D = R[knots] @ covariances @ np.swapaxes(R[knots], 1, 2)
-    way = along + 1e-9 * np.arange(n)  # stationary robot: by steps
+    length = along + 1e-9 * np.arange(n)  # stationary robot: by steps
     j = np.clip(np.searchsorted(knots, np.arange(n), side="right") - 1, 0, len(knots) - 2)
-    a, b = way[knots[j]], way[knots[j + 1]]
-    u = ((way - a) / (b - a))[:, None, None]
+    a, b = length[knots[j]], length[knots[j + 1]]
+    u = ((length - a) / (b - a))[:, None, None]
     return np.asarray(np.swapaxes(R, 1, 2) @ ((1.0 - u) * D[j] + u * D[j + 1]) @ R)
 
 

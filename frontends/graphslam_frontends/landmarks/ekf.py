@@ -143,9 +143,9 @@ class EkfRun:
         times, points = self.data.observations.times[self.first : self.next], None
         if feed is not None and has_fixes(feed, self.t_start, times):
             s = self._smoothed(places, rows, landmark, 0.0)
-            way = place_fixes(feed, s, self.t_start, times)
-            if way is not None and np.all(s.landmark_kept):
-                points = transfer_points(fix_points(s, way), s.gaussian, mean, P)
+            placed = place_fixes(feed, s, self.t_start, times)
+            if placed is not None and np.all(s.landmark_kept):
+                points = transfer_points(fix_points(s, placed), s.gaussian, mean, P)
         return self._hand_over(
             key,
             Gaussian(mean, P, (2,)),
@@ -168,7 +168,7 @@ class EkfRun:
         used = int(s.kept.sum())
         places = s.gaussian.mean[3:].reshape(-1, 2)
         report |= {"systematic": bias_score_test(data, self.first, self.next, rows[s.kept], index, s.poses, places)}
-        way = place_fixes(feed, s, self.t_start, obs.times[span])
+        placed = place_fixes(feed, s, self.t_start, obs.times[span])
         counts = self.report(used) | {"not_associated": self.map.observations - len(rows)}
         return self._hand_over(
             key,
@@ -177,7 +177,7 @@ class EkfRun:
             np.column_stack([data.original[rows[s.kept]], index]),
             self.trajectory(s.poses, s.pose_covariances),
             report | {"handover": "smoothed", "trimmed": len(s.kept) - used} | counts | s.report(),
-            None if way is None else fix_points(s, way),
+            None if placed is None else fix_points(s, placed),
         )
 
     def _hand_over(

@@ -145,19 +145,19 @@ def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, t
     return FixPlacement(at_fixes, lever, at, share[:, 0], antenna(poses[k], poses[k + 1]), G[0], G[1])
 
 
-def fix_points(smoothed: SmoothingResult, way: FixPlacement) -> PathPoints:
+def fix_points(smoothed: SmoothingResult, placed: FixPlacement) -> PathPoints:
     """Points of a submap's path at the fixes inside it.
 
     Between two scans the path is the arc from one pose to the next; the deviation from it has the variance of a
     Brownian bridge, ``a (1 - a) Q`` at the fraction a of a step whose odometry has the covariance Q.
     """
     cross, own = path_covariances(
-        smoothed.poses, smoothed.landmarks, smoothed.evidence, way.at, way.by_first, way.by_second
+        smoothed.poses, smoothed.landmarks, smoothed.evidence, placed.at, placed.by_first, placed.by_second
     )
     exit_turn = rotation2(smoothed.poses[-1, 2])
     cross[:, :2] = cross[:, :2] @ exit_turn.T  # right tangent of the exit -> plain vector of eq. 15
     Q = np.linalg.inv(smoothed.evidence.W)[:, :2, :2]
-    k, share = way.at + 1, way.share
+    k, share = placed.at + 1, placed.share
     for i in range(len(k)):
         R = rotation2(smoothed.poses[k[i], 2])
         for j in range(i, len(k)):
@@ -169,5 +169,5 @@ def fix_points(smoothed: SmoothingResult, way: FixPlacement) -> PathPoints:
                 own[2 * j : 2 * j + 2, 2 * i : 2 * i + 2] += bridge
     own[np.diag_indices(len(own))] += FLOOR**2
     return PathPoints(
-        times=way.times, lever=way.lever, positions=way.positions, covariance=0.5 * (own + own.T), cross=cross
+        times=placed.times, lever=placed.lever, positions=placed.positions, covariance=0.5 * (own + own.T), cross=cross
     )

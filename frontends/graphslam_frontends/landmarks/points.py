@@ -103,17 +103,17 @@ class Points(FrontEnd):
 
     def _end(self, steps: Odometry, points: PointObservations, first: int) -> tuple[int, str]:
         """The last scan of the submap that begins at scan ``first``, and the reason."""
-        c, way = self.config, 0.0
+        c, length = self.config, 0.0
         hits: dict[int, int] = {}
         end = len(points.times) - 1
         for k in range(first + 1, end + 1):
-            way += float(np.linalg.norm(steps.increments[k, :3]))
+            length += float(np.linalg.norm(steps.increments[k, :3]))
             for i in points.ids[points.scan(k)].tolist():
                 hits[i] = hits.get(i, 0) + 1
             n = k - first
             if n < MIN_SCANS or end - k < MIN_SCANS:
                 continue
-            if way >= c.max_distance:
+            if length >= c.max_distance:
                 return k, "distance"
             if n >= c.max_scans:
                 return k, "scans"

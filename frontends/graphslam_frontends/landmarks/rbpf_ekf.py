@@ -181,11 +181,11 @@ class RbpfEkf(FrontEnd):
         used = rows[smoothed.kept]
         report["systematic"] = bias_score_test(data, first, last, used, lm_index, smoothed.poses, places)
         whole = c.handover == "smoothed"
-        way = place_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
+        placed = place_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
         biases = None
         if whole and c.biases is not None:
             seconds = np.diff(obs.times[span], prepend=t_start)
-            biases = estimate_sensor_biases(c.biases, smoothed, seconds, way, base=t_start < obs.times[first])
+            biases = estimate_sensor_biases(c.biases, smoothed, seconds, placed, base=t_start < obs.times[first])
             report["biases"] = [n for n in biases.names if n]
         landmarks = LandmarkMap(
             ids=ids,
@@ -194,7 +194,7 @@ class RbpfEkf(FrontEnd):
             covariance=handed.covariance,
             detections=np.column_stack([data.original[used], lm_index]),
             chart="group" if whole else "cartesian",  # particles: as in the paper
-            path=None if way is None else fix_points(smoothed, way),
+            path=None if placed is None else fix_points(smoothed, placed),
             biases=biases,
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)

@@ -50,7 +50,7 @@ def possible_biases(log: SensorLog, detector: TreeDetectorConfig) -> SensorBiasC
 
 
 def estimate_sensor_biases(
-    config: SensorBiasConfig, smoothed: SmoothingResult, seconds: Array, way: FixPlacement | None, *, base: bool
+    config: SensorBiasConfig, smoothed: SmoothingResult, seconds: Array, fix: FixPlacement | None, *, base: bool
 ) -> SensorBiases:
     """Sensitivity of a smoothed submap to constant errors, and its information on them.
 
@@ -58,7 +58,7 @@ def estimate_sensor_biases(
     ----------
     seconds : (T,)
         Duration of each increment of the odometry.
-    way : FixPlacement or None
+    fix : FixPlacement or None
         Points of the path at fixes.
     base : bool
         The trajectory begins with the base, which is fixed.
@@ -97,8 +97,8 @@ def estimate_sensor_biases(
     exit_moved = moved[-1].copy()
     exit_moved[:2] = rotation2(smoothed.poses[-1, 2]) @ exit_moved[:2]  # right tangent → plain vector of eq. 15
     points, before = np.zeros((0, len(CONSTANTS))), np.concatenate([np.zeros((1, 3, len(CONSTANTS))), moved])
-    if way is not None:
-        points = (way.by_first @ before[way.at + 1] + way.by_second @ before[way.at + 2]).reshape(-1, len(CONSTANTS))
+    if fix is not None:
+        points = (fix.by_first @ before[fix.at + 1] + fix.by_second @ before[fix.at + 2]).reshape(-1, len(CONSTANTS))
     return SensorBiases(
         names=names, sigmas=sigmas, response=np.concatenate([exit_moved, shifted]), score=score,
         information=information, path=before if base else moved, points=points,

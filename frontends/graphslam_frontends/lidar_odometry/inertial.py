@@ -157,13 +157,13 @@ def cumulative_products(turns: Array) -> Array:
 
 
 def fit_velocity_gravity(
-    way: InertialMotion, positions: Array, variance: Array, gravity: Array, sigma: float
+    motion: InertialMotion, positions: Array, variance: Array, gravity: Array, sigma: float
 ) -> tuple[Array, Array, Array]:
     """Least-squares velocity and gravity in the body frame at the anchor, from positions ``(m, 3)``.
 
     Parameters
     ----------
-    way : InertialMotion
+    motion : InertialMotion
         At the times of the positions.
     positions : (m, 3)
     variance : (m,)
@@ -176,10 +176,10 @@ def fit_velocity_gravity(
     covariance : (3, 3)
         Of position, velocity and gravity along any axis.
     """
-    A = np.stack([np.ones_like(way.seconds), way.seconds, 0.5 * way.seconds**2], axis=1)
+    A = np.stack([np.ones_like(motion.seconds), motion.seconds, 0.5 * motion.seconds**2], axis=1)
     W = A / variance[:, None]
     N = A.T @ W + np.diag([0.0, FASTEST**-2, sigma**-2])
-    b = W.T @ (positions - way.p)
+    b = W.T @ (positions - motion.p)
     b[2] += gravity / sigma**2
     C = np.linalg.inv(N)
     x = C @ b
@@ -235,8 +235,8 @@ class InertialPredictor:
         if not (self.believed and self.known) or not 0.0 < time - self.kept[-1][0] <= LONGEST:
             return None
         last, pose = self.kept[-1]
-        way = self.readings.way(last, np.array([time]), self.bias)
-        return None if way is None else np.asarray(se3.se3_compose(pose, way.poses(self.velocity, self.gravity)[0]))
+        step = self.readings.way(last, np.array([time]), self.bias)
+        return None if step is None else np.asarray(se3.se3_compose(pose, step.poses(self.velocity, self.gravity)[0]))
 
     def reach(self, time: float) -> float:
         """Largest accepted distance of a match from :meth:`ahead` [m]: several σ plus an acceleration error.
@@ -258,10 +258,10 @@ class InertialPredictor:
         # readings are interpolated linearly, and so are the motions between them
         knots = time - np.array([ages.max(), ages.min()])
         at = np.concatenate([knots[:1], t[(t > knots[0]) & (t < knots[1])], knots[1:]])
-        way = self.readings.way(last, np.append(at, time), self.bias)
-        if way is None:
+        motion = self.readings.way(last, np.append(at, time), self.bias)
+        if motion is None:
             return None
-        T = way.poses(self.velocity, self.gravity)
+        T = motion.poses(self.velocity, self.gravity)
         T = se3.se3_between(np.broadcast_to(T[-1], T[:-1].shape), T[:-1])
         xi = np.concatenate([se3.so3_log(T[:, 3:]), T[:, :3]], axis=1)
         x = np.stack([np.interp(time - ages, at, column) for column in xi.T], axis=1)
@@ -280,11 +280,11 @@ class InertialPredictor:
         """Update with a scan matched at ``pose``; constant velocity predicted ``even`` (both ``T_first_body``)."""
         if self.kept and time > self.kept[-1][0]:
             before, last = self.kept[-1]
-            way = self.readings.way(before, np.array([time]), self.bias)
-            if way is None:
+            motion = self.readings.way(before, np.array([time]), self.bias)
+            if motion is None:
                 self.forget()
             else:
-                self._compare(time - before, se3.se3_between(last, pose), way, se3.se3_between(last, even))
+                self._compare(time - before, se3.se3_between(last, pose), motion, se3.se3_between(last, even))
         elif self.kept:
             return  # same time stamp
         self.kept.append((time, pose))
@@ -311,9 +311,9 @@ class InertialPredictor:
         self.kept.clear()
         self.known = False
 
-    def _compare(self, dt: float, made: Array, way: InertialMotion, even: Array) -> None:
+    def _compare(self, dt: float, made: Array, motion: InertialMotion, even: Array) -> None:
         """Kalman update of the gyro bias by a matched rotation, and comparison of the rotation errors."""
-        off = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], way.q[0])))
+        off = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], motion.q[0])))
         worse = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], even[3:])))
         self.missed.append((float(off @ off), float(worse @ worse)))
         n = self.readings.noise
@@ -329,8 +329,8 @@ class InertialPredictor:
         """Velocity and gravity in the body frame at scan k of the window (default: the last), from all positions."""
         anchor, pose = self.kept[k]
         at = np.array([t for t, _ in self.kept])
-        way = self.readings.way(anchor, at, self.bias)
-        if way is None or len(at) < (2 if self.known else 3):
+        motion = self.readings.way(anchor, at, self.bias)
+        if motion is None or len(at) < (2 if self.known else 3):
             self.known = False
             return
         if self.known:
@@ -340,10 +340,10 @@ class InertialPredictor:
             guess, sigma = se3.quat_rotate(turn, self.gravity), GRAVITY_SIGMA[1]
         else:
             # the mean specific force, neglecting the acceleration of the body
-            guess, sigma = -way.v[0] / way.seconds[0], GRAVITY_SIGMA[0]
+            guess, sigma = -motion.v[0] / motion.seconds[0], GRAVITY_SIGMA[0]
         there = se3.se3_between(np.broadcast_to(pose, (len(at), 7)), np.array([p for _, p in self.kept]))[:, :3]
-        variance = self.readings.doubt(way.seconds, float(np.sqrt(self.bias_var)))
-        self.velocity, self.gravity, self.cov = fit_velocity_gravity(way, there, variance, guess, sigma)
+        variance = self.readings.doubt(motion.seconds, float(np.sqrt(self.bias_var)))
+        self.velocity, self.gravity, self.cov = fit_velocity_gravity(motion, there, variance, guess, sigma)
         self.known = True
         self._up = se3.quat_rotate(pose[3:], -self.gravity / np.linalg.norm(self.gravity))
 
@@ -412,14 +412,14 @@ def gravity_along_path(inertial: InertialPredictor, times: Array, poses: Array) 
         if b - a < 3 or (at and t <= at[-1]):
             continue
         some = np.arange(a, b)
-        way = readings.way(t, times[some], inertial.bias)
-        if way is None:
+        motion = readings.way(t, times[some], inertial.bias)
+        if motion is None:
             continue
-        span = way.seconds[-1] - way.seconds[0]
-        guess = -(way.v[-1] - way.v[0]) / span
+        span = motion.seconds[-1] - motion.seconds[0]
+        guess = -(motion.v[-1] - motion.v[0]) / span
         there = se3.se3_between(np.broadcast_to(poses[k], (len(some), 7)), poses[some])[:, :3]
-        variance = readings.doubt(way.seconds, float(np.sqrt(inertial.bias_var)))
-        _, gravity, C = fit_velocity_gravity(way, there, variance, guess, GRAVITY_SIGMA[0])
+        variance = readings.doubt(motion.seconds, float(np.sqrt(inertial.bias_var)))
+        _, gravity, C = fit_velocity_gravity(motion, there, variance, guess, GRAVITY_SIGMA[0])
         at.append(t)
         ups.append(se3.quat_rotate(poses[k, 3:], -gravity / np.linalg.norm(gravity)))
         variances.append(C[2, 2] + noise.accelerometer**2 / span)

@@ -123,8 +123,8 @@ def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
     """
     if tilt is None:
         return None
-    way = np.linalg.norm(increments[:, :3], axis=1)
-    moved = way > 0.5 * float(np.median(way))
+    length = np.linalg.norm(increments[:, :3], axis=1)
+    moved = length > 0.5 * float(np.median(length))
     return tilt - np.median(tilt[moved if moved.any() else slice(None)], axis=0)
 
 

@@ -229,21 +229,21 @@ def _match(source: Target, target: Target, T: Array, matching: RegistrationConfi
     group = group_of(T)
     xi = group.log(T)
 
-    def scaled(way: float, turn: float) -> Array:
+    def scaled(shift: float, turn: float) -> Array:
         y = xi.copy()
-        y[group.position] *= way
+        y[group.position] *= shift
         y[group.heading] *= turn
         return cast(Array, group.exp(y))
 
     if np.linalg.norm(xi[group.position]) < 0.2 and abs(xi[group.heading]) < 0.1:
         found = register_starts(source, target, [T], matching)
         if not (found and found[0].accepted):  # the odometry may show no motion while the body moves ahead or back
-            ways = []
+            starts = []
             for metres in (0.8, 1.6, -0.8):
                 y = xi.copy()
                 y[0 if group.dim == 2 else 3] = metres
-                ways.append(group.exp(y))
-            found = distinct_registrations([*found, *register_starts(source, target, ways, matching)])
+                starts.append(group.exp(y))
+            found = distinct_registrations([*found, *register_starts(source, target, starts, matching)])
     else:
         found = register_starts(source, target, [T, scaled(0.0, 0.0)], matching, apart=(0.2, 0.05))
         if len(found) != 1:

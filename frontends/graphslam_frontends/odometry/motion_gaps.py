@@ -213,9 +213,9 @@ def _widened(odometry: Odometry, gaps: list[MotionGap]) -> Array:
         heading = min(gap.yaw_rate_sigma * T, HEADING_UNKNOWN) / T
         for k in np.flatnonzero(inside > 0.0):
             h = inside[k]
-            turn, way = heading * np.sqrt(T * h), abs(gap.speed) * h
+            turn, length = heading * np.sqrt(T * h), abs(gap.speed) * h
             # along: the distance, and its loss by a bend; across: displacement of the end of an arc by a rotation
-            along = np.hypot(gap.speed_sigma * np.sqrt(T * h), way * min(turn**2, 1.0) / 4.0)
-            across = way * turn / np.sqrt(3.0) + 0.1 * along
+            along = np.hypot(gap.speed_sigma * np.sqrt(T * h), length * min(turn**2, 1.0) / 4.0)
+            across = length * turn / np.sqrt(3.0) + 0.1 * along
             covariances[k] += np.diag(np.square([along, across, turn]))
     return covariances

@@ -126,14 +126,14 @@ def scan_window_submaps(
     n = len(steps)
     if n < 2:
         raise DataError("too few steps for a submap", where=steps.name, got=n, wanted="at least 2")
-    tracker, way = ScanToWindowOdometry(steps, window), steps.path_length
+    tracker, along = ScanToWindowOdometry(steps, window), steps.path_length
     start, key, states = 0, 0, []
     for k in range(n):
         found = tracker.step()
         if k == 0:
             tracker.begin()
         states.append((tracker.pose, tracker.joint, found))
-        full = way[k] - way[start] >= config.length and steps.times[k] - steps.times[start] >= config.seconds - 1e-6
+        full = along[k] - along[start] >= config.length and steps.times[k] - steps.times[start] >= config.seconds - 1e-6
         if k == n - 1 or full:
             if key >= first_key:
                 ended = LAST if k == n - 1 else "length"

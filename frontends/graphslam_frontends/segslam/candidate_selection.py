@@ -111,8 +111,8 @@ def _places(
     owner = np.repeat(np.arange(len(place)), sizes)
     steps = np.arange(int(sizes.sum())) - first[owner] + t.start[index][owner]
     L = segmap.path_length
-    way = sample.travelled[place][owner] + np.abs(L[steps] - L[sample.anchor[place]][owner])
-    return _Places(place, index, np.concatenate(paths), owner, first, way, config.drift(way)), recent
+    length = sample.travelled[place][owner] + np.abs(L[steps] - L[sample.anchor[place]][owner])
+    return _Places(place, index, np.concatenate(paths), owner, first, length, config.drift(length)), recent
 
 
 def select_candidates(

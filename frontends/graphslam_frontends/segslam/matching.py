@@ -250,7 +250,7 @@ class Matcher:
         modes: dict[int, list[tuple[Array, float, list[Array]]]] = {}  # of maps that begin at one step
         searches = registrations = 0
         for c in asked:
-            for segment, T, sigma, way in zip(c.segments.tolist(), c.T_map_body, c.sigma, c.travelled):
+            for segment, T, sigma, length in zip(c.segments.tolist(), c.T_map_body, c.sigma, c.travelled):
                 m = int(self.segmap.table.map[segment])
                 key = (m, *np.rint(T[:2] / SAME_START).astype(int).tolist(), round(float(heading_of(T)) / 0.1))
                 if key in done or len(done) >= s.most_searches:
@@ -266,8 +266,8 @@ class Matcher:
                 starts = next((f for at, r, f in alike if np.linalg.norm((T - at)[:2]) <= 0.25 * min(r, radius)), None)
                 first = starts is None
                 if starts is None:
-                    height = [] if planar else [s.height + self.config.winnowing.rise(float(way))]
-                    starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(way))])
+                    height = [] if planar else [s.height + self.config.winnowing.rise(float(length))]
+                    starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(length))])
                     searches += 1
                 found = register_starts(cloud, target, starts, rules)
                 registrations += len(starts)

@@ -279,11 +279,11 @@ class Segmenter:
             The path of its map was here before; only then may the ground be known.
         """
         c = self.config
-        seconds, way = time - self.time, length - self.length
-        if not (seconds >= 0.0 and way >= -1e-9 and math.isfinite(seconds) and math.isfinite(way)):
-            raise GeometryError("a segment runs backwards", got=f"{seconds} s, {way} m", wanted="≥ 0")
+        seconds, driven = time - self.time, length - self.length
+        if not (seconds >= 0.0 and driven >= -1e-9 and math.isfinite(seconds) and math.isfinite(driven)):
+            raise GeometryError("a segment runs backwards", got=f"{seconds} s, {driven} m", wanted="≥ 0")
         self.last = time
-        error = float(motion_error([way], [turned - self.turned], c.motion_translation, c.motion_rotation)[-1])
+        error = float(motion_error([driven], [turned - self.turned], c.motion_translation, c.motion_rotation)[-1])
         counts = not math.isnan(score) and seconds >= c.excluded - 1e-6
         known = counts and again and score >= KNOWN_SCORE
         if counts:
@@ -294,23 +294,23 @@ class Segmenter:
         if not known:  # since the last decision; without a score the ground counts as new
             self.new_ground += length - self.seen
         self.seen = length
-        why = self._why(seconds, way, error, score if counts else math.nan)
+        why = self._why(seconds, driven, error, score if counts else math.nan)
         ends = bool(why)
         if ends and not why.startswith("max"):
             if seconds < c.min_seconds - 1e-6 and why != "period":
                 ends, why = False, "young"
-            elif way < c.min_length:
+            elif driven < c.min_length:
                 ends, why = False, "short"
         return SegmentDecision(
-            ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=way,
+            ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=driven,
             new_ground=self.new_ground, error=error,
         )  # fmt: skip
 
-    def _why(self, seconds: float, way: float, error: float, score: float) -> str:
+    def _why(self, seconds: float, driven: float, error: float, score: float) -> str:
         c = self.config
         if self.new_ground >= c.max_length - 1e-9:
             return "max-length"
-        if seconds >= c.max_seconds and way >= c.min_length:
+        if seconds >= c.max_seconds and driven >= c.min_length:
             return "max-seconds"
         if c.period:
             return "period" if seconds >= c.period - 1e-6 else ""

@@ -62,10 +62,10 @@ def join_command(
     s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
     material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
-    way = methods_for(material)
-    way.check(method)
+    available = methods_for(material)
+    available.check(method)
     compile_method(material, method, polish=polish)  # so that the printed time excludes compilation
-    filters = method in way.joiners
+    filters = method in available.joiners
     estimate = own = join_by(
         material,
         method,
@@ -76,7 +76,7 @@ def join_command(
         progress=not as_json,
     )
     if polish and filters:
-        estimate = way.polish(material, own)
+        estimate = available.polish(material, own)
     truth = s.truth if associate == "given" else None
     value: dict[str, Any] = join_json(material, method, estimate, truth=truth, own=own if polish and filters else None)
     plain = isinstance(material, Sequence)

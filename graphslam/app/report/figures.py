@@ -96,15 +96,15 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
     from graphslam.plots.loops import plot_loops
     from graphslam.plots.save import figure_png
 
-    ties = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
-    if not ties:
+    links = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
+    if not links:
         return [missing_note("loop closures between sessions: none from place recognition.")]
     try:
         nodes = read_merged_dense(folder.path)["nodes"]
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
         gap = np.full((1, 2), np.nan)  # interrupts the line
         path = np.concatenate([x for p in paths for x in (p, gap)])
-        ends = [(e["i"], e["j"], "accepted") for e in ties]
+        ends = [(e["i"], e["j"], "accepted") for e in links]
         ax = plot_loops(None, path, nodes, ends, title="loop closures between sessions, from above")
     except GraphSlamError as error:
         return [missing_note("loop closures between sessions: ", _error_text(folder, error), ".")]

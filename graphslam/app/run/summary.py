@@ -281,8 +281,8 @@ def _rank(code: str, over: set[str]) -> int:
 def _made(figures: RunMetrics) -> str:
     """``305 m in 7 submaps, 4 loop closures``."""
     m = figures.metrics
-    way = m.get("path_length")
-    length = length_text(float(way)) if way is not None and is_finite_number(way) else ""
+    metres = m.get("path_length")
+    length = length_text(float(metres)) if metres is not None and is_finite_number(metres) else ""
     if figures.sessions:
         out = [f"{len(figures.sessions)} sessions"]
     else:

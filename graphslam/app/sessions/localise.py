@@ -187,22 +187,22 @@ def _localise(
     known = session_of(run, "map")
     new = _query(run, known, submaps)
     two = TwoSessions(known.map, new.map)
-    ties = two.find(config, progress=progress)
-    if ties.why:
-        return LocalisationResult(ties.why, ties, [])
+    loops = two.find(config, progress=progress)
+    if loops.why:
+        return LocalisationResult(loops.why, loops, [])
     graph = FactorGraph(known.submaps[0].dim)
     solver = make_solver(solver_name, graph)
     add_session(graph, known)
     solver.solve_to_optimum()
     try:
-        at = connect_session(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
+        at = connect_session(graph, solver, known, 0, new, config=config, found=(two, loops), progress=progress)
     except SolverError as error:
-        return LocalisationResult(str(error), ties, [])
+        return LocalisationResult(str(error), loops, [])
     end = graph.submaps[-1].exit_node
     P = graph.covariance()
     poses = graph.values.poses
     return LocalisationResult(
-        "", ties, at.used, poses[at.first_node].copy(), P.marginal(f"x{at.first_node}"),
+        "", loops, at.used, poses[at.first_node].copy(), P.marginal(f"x{at.first_node}"),
         poses[end].copy(), P.marginal(f"x{end}"),
     )  # fmt: skip
 

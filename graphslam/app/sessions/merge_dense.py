@@ -86,8 +86,8 @@ class MergedSubmaps:
         paths = {s.name: s.trajectory for s in self.sessions}
         if self.graph.dim == 3:
             paths = {k: plan_path(v) for k, v in paths.items()}
-        ties = sum(len(s.attached.used) for s in self.sessions if s.attached is not None)
-        return plot_paths(ax, paths, title=f"{len(paths)} sessions, {ties} loop closures between them")
+        count = sum(len(s.attached.used) for s in self.sessions if s.attached is not None)
+        return plot_paths(ax, paths, title=f"{len(paths)} sessions, {count} loop closures between them")
 
     def __repr__(self) -> str:
         return f"MergedSubmaps({len(self.sessions)} sessions, {len(self.graph.submaps)} submaps)"

@@ -336,9 +336,9 @@ class GpsFactors(SensorFactors):
         inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
         for fid in inside:
             del self.graph.records[fid]
-        tied = [t.fix.factor_id for t in self.tied if t.node in own]
+        placed = [t.fix.factor_id for t in self.tied if t.node in own]
         self.tied = [t for t in self.tied if t.node not in own]
-        self._drop([(i, "its submap was removed") for i in [*tied, *inside]])
+        self._drop([(i, "its submap was removed") for i in [*placed, *inside]])
         self._leave_points(self.graph.submap(s.key))
 
     def remove_unused(self, removed: FactorRecord) -> None:

@@ -211,8 +211,8 @@ class ImuFactors(SensorFactors):
         """Remove the IMU factors inside a submap that is removed."""
         inside = set(submap.nodes)
         for fid, r in list(self.graph.records.items()):
-            way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
-            if way or (isinstance(r, ForceRecord) and r.node in inside):
+            interval = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
+            if interval or (isinstance(r, ForceRecord) and r.node in inside):
                 self.graph.take_out(fid, "its submap was removed")
 
     def remove_unused(self, removed: FactorRecord) -> None:
@@ -220,8 +220,8 @@ class ImuFactors(SensorFactors):
         linked to it as a random walk; velocities and biases without factors are removed."""
         if not self.used:
             return
-        ways = {(r.i, r.j) for r in self.graph.records.values() if isinstance(r, ImuRecord)}
-        if isinstance(removed, ImuRecord) and (removed.i, removed.j) not in ways:
+        intervals = {(r.i, r.j) for r in self.graph.records.values() if isinstance(r, ImuRecord)}
+        if isinstance(removed, ImuRecord) and (removed.i, removed.j) not in intervals:
             self._level_inside([(removed.i, removed.j)], give_up=False)
         for stream in self.used:
             self._relink(stream)
@@ -311,14 +311,14 @@ class ImuFactors(SensorFactors):
         weight = pim.seconds >= np.median(pim.seconds)
         return np.concatenate([np.median(w[weight], axis=0), np.zeros(3)])
 
-    def _start_velocities(self, ways: Sequence[ImuRecord], first: int) -> None:
+    def _start_velocities(self, records: Sequence[ImuRecord], first: int) -> None:
         """Initialise velocities from row ``first`` on, from the preintegrated measurements (eq. 33 solved for them)."""
         v = self.graph.values.velocities
         if len(v) == first:
             return
         tilt = self.graph.values.tilt
         up = np.zeros(3) if tilt is None else GRAVITY * up_turn(tilt)[0][:, 2]  # 2-D forces do not include gravity
-        for r in ways:
+        for r in records:
             a, b = r.velocities
             X = se3_compose(lift("x", self.graph.values.poses[[r.i, r.j]]), np.stack([r.T_i_imu, r.T_j_imu]))
             T, R = r.seconds, quat_to_matrix(X[0, 3:])
@@ -339,13 +339,13 @@ class ImuFactors(SensorFactors):
             records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
         i, j = (np.array([getattr(r, n) for r in fresh]) for n in "ij")
         vs, bs = np.array([r.velocities for r in fresh]), np.array([r.biases for r in fresh])
-        ways = PreintegrationArrays(fresh)
+        arrays = PreintegrationArrays(fresh)
         J = preintegration_terms(
-            ways, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], tilt
+            arrays, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], tilt
         )[1]  # fmt: skip
         local = np.array([r.local for r in fresh])
         P = pim.covariance.copy()
-        for side, (columns, L) in enumerate(((XI, ways.L_i), (XJ, ways.L_j))):
+        for side, (columns, L) in enumerate(((XI, arrays.L_i), (XJ, arrays.L_j))):
             U = J[:, :, columns] @ se3_adjoint(L)  # by the unit's own right tangent
             P += U @ local[:, side] @ np.swapaxes(U, 1, 2)
         for r, Pk in zip(fresh, P):

@@ -120,11 +120,11 @@ def follow_ground(s, z, n, foot, f, ground, chain):
         if raised:
             chain[i, 0], chain[i, 1] = base_s, base_z
         ground[i] = 0
-        way = s[i] - last_s
-        off = z[i] - (last_z + slope * way)
+        step = s[i] - last_s
+        off = z[i] - (last_z + slope * step)
         # the lowest beam can meet the ground far from the sensor, which is then the first known ground
-        near = way < 2.0 * f.memory or not found
-        if way > -0.05 and abs(off) < f.residual + f.residual_rate * max(way, 0.0) and near:
+        near = step < 2.0 * f.memory or not found
+        if step > -0.05 and abs(off) < f.residual + f.residual_rate * max(step, 0.0) and near:
             accept = 1
             run = 0
         else:
@@ -151,7 +151,7 @@ def follow_ground(s, z, n, foot, f, ground, chain):
             run = 0
         first_seen = not found
         ground[i], found = accept, True
-        if accept == 1 and abs(way) < 0.03:
+        if accept == 1 and abs(step) < 0.03:
             continue  # do not follow a wall upwards point by point
         if first_seen and z[i] - foot > f.climb:
             # the ground up to here was not observed: a slope, or a bumper below the lowest beam

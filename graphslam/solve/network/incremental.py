@@ -103,8 +103,8 @@ def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) 
             pose = held[v] if v in held else _from_neighbour(graph, network, v, links, node, z, z_back)
             graph.append_node(pose)
             if v in held:
-                tie = group.between(origin, pose)
-                graph.insert(BetweenRecord(graph.next_factor(), 0, count, tie, np.eye(group.dof) / HELD_SIGMA))
+                offset = group.between(origin, pose)
+                graph.insert(BetweenRecord(graph.next_factor(), 0, count, offset, np.eye(group.dof) / HELD_SIGMA))
         for e in links:
             i, j = ends[e].tolist()
             graph.insert(BetweenRecord(graph.next_factor(), i, j, z[e], W[e]))

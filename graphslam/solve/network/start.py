@@ -156,8 +156,8 @@ def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
     else:
         q = network.measurements[:, 3:]
         step = np.tile([0.0, 0.0, 0.0, 1.0], (len(network), 1))
-        ways = q[tree.edge[branch]]
-        step[branch] = np.where(tree.forward[branch, None], ways, ways * [-1.0, -1.0, -1.0, 1.0])
+        turns = q[tree.edge[branch]]
+        step[branch] = np.where(tree.forward[branch, None], turns, turns * [-1.0, -1.0, -1.0, 1.0])
         measured = tree.rooted(step, se3.quat_multiply)
         # signs of the poses' quaternions such that no edge of the tree turns by more than half a turn
         x = poses[:, 3:]

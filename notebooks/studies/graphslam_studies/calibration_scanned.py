@@ -135,8 +135,8 @@ def scanned(
         "calibrated": (worse, unknown),
         "stated": (worse, known),
     }
-    for way in ways:
-        yield from _mapped(way, *made[way], frontend, seed)
+    for variant in ways:
+        yield from _mapped(variant, *made[variant], frontend, seed)
 
 
 def _measurements(

@@ -79,9 +79,9 @@ def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
     yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
     yield from _recovered(robot, log, found)
-    ways = {"stated": {"use": "none"}, "calibrated": found.config()}
-    ways["oracle"] = {"use": "none", "given": options_dict(true_figures(robot))}
-    for name, calibrate in ways.items():
+    variants = {"stated": {"use": "none"}, "calibrated": found.config()}
+    variants["oracle"] = {"use": "none", "given": options_dict(true_figures(robot))}
+    for name, calibrate in variants.items():
         yield from _mapped(name, log, {**OPTIONS, "calibrate": calibrate}, seed)
 
 

@@ -92,8 +92,8 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
         yield from judge.figures(kind, *with_fixes(end, gps, how))
     lost = sum(int(s.report.get("scans_lost", 0)) for s in submaps)
     steps = sum(int(s.report.get("steps", 0)) for s in submaps)
-    tied = [r for r in end.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
-    yield Measurement("alone", "loops", float(len(tied)))
+    loops = [r for r in end.graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
+    yield Measurement("alone", "loops", float(len(loops)))
     yield Measurement("odometry", "scans_lost", lost / max(steps, 1))
     yield Measurement("odometry", "length", float(log.meta["length"]))
     yield Measurement("joint", "fixes", float(len(gps.times)))

@@ -204,7 +204,7 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
         once = RelaxConfig(
             method="levels", levels=PreconditionerLevels(0, 1), iterations=1, soft=0, split=False, halve=False
         )
-        ways: dict[str, Poses] = {
+        variants: dict[str, Poses] = {
             "dead reckoning": start,
             "relinearised": relax_skeleton(problem, replace(TIGHT, split=False, start="odometry")).poses,
             "relinearised, forward pass": relax_skeleton(problem, replace(TIGHT, split=False)).poses,
@@ -212,8 +212,8 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
             "links fixed once": linked(problem, start),
         }
         layout = WorkRanges(problem, Workers(1))
-        for way, poses in ways.items():
-            name = f"{way}; {1e3 * turn:g} mrad"
+        for variant, poses in variants.items():
+            name = f"{variant}; {1e3 * turn:g} mrad"
             network = Network(layout, poses)
             yield Measurement(name, "chi2", network.objective / problem.freedom)
             yield Measurement(name, "gap", network.objective - best.objective)

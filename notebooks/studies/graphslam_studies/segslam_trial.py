@@ -276,10 +276,10 @@ class GridTrial:
     def _climbs(self, name: str, path: Trajectory) -> Iterator[Measurement]:
         """Mean errors of the climb of ramps, separately up and down; errors in height, in the plane and in heading."""
         found = judge.climbs(path.poses, self.truth)
-        for way, of in (("up", found.true > 0), ("down", found.true < 0)):
+        for direction, of in (("up", found.true > 0), ("down", found.true < 0)):
             if of.any():
-                yield Measurement(name, f"climb_{way}", float(found.error[of].mean()))
-                yield Measurement(name, f"climb_{way}_size", float(np.abs(found.error[of]).mean()))
+                yield Measurement(name, f"climb_{direction}", float(found.error[of].mean()))
+                yield Measurement(name, f"climb_{direction}_size", float(np.abs(found.error[of]).mean()))
         est, true = (judge.relative(poses) for poses in (path.poses, self.truth))
         yield Measurement(name, "height_std", float(np.std(est[:, 2] - true[:, 2])))
         flat = [Trajectory(path.times, np.column_stack([p[:, :2], heading_of(p)])) for p in (est, true)]

@@ -141,11 +141,11 @@ def run_surface_trial(config: SurfaceTrialConfig, seed: int) -> Iterator[Measure
     seen = look(c, seed)
     judge = Judge(seen, SeedTree(int(seed)).child("surface judge").generator())
     base = replace(c.surface, voxel=c.voxel)
-    ways = {f"level-set {s:g}": replace(base, smoothing=s) for s in c.smoothings}
+    variants = {f"level-set {s:g}": replace(base, smoothing=s) for s in c.smoothings}
     if c.beside:
-        ways["planes, no carving"] = replace(base, smoothing=0.0, carving=False, steps=0, redistance_steps=0)
-        ways["ray tsdf"] = replace(ways["planes, no carving"], data="rays")
-    for name, made in ways.items():
+        variants["planes, no carving"] = replace(base, smoothing=0.0, carving=False, steps=0, redistance_steps=0)
+        variants["ray tsdf"] = replace(variants["planes, no carving"], data="rays")
+    for name, made in variants.items():
         begin = process_time()
         layer = surface_of(seen.scans, seen.poses, made, c.per_piece)
         pieces_s = process_time() - begin

@@ -204,10 +204,10 @@ class Navigator:
         costs = cost_map(found, self.vehicle, CostConfig(closing_bands=CLOSING))
         outside = (np.abs(y) > HALF_WIDTH)[:, None] | ((x < BEGIN) | (x > END))[None]
         costs = replace(costs, cost=np.where(outside, np.inf, costs.cost))
-        way = _plan(costs, place, goal)
-        if way is None:
+        planned = _plan(costs, place, goal)
+        if planned is None:
             return None
-        points = _smooth(way.points, costs)
+        points = _smooth(planned.points, costs)
         points = np.vstack([place, points[1:]]) if len(points) > 1 else np.vstack([place, place])
         speed = self._speed(points, found) if self.bound else self.config.fastest
         return Command(points, speed)
@@ -220,14 +220,14 @@ class Navigator:
         classes[verdict.hazard & verdict.known] = TerrainClass.OBSTACLE
         return _plain_map(np.array(BOX[:2]), CELLS[0], classes)
 
-    def _speed(self, way: Array, found: TerrainMap) -> float:
+    def _speed(self, path: Array, found: TerrainMap) -> float:
         """Speed limit [m/s]: detection range of falls, and stopping before unknown ground or possible falls."""
         confirmed = found.known & ~found.provisional
         confirmed = binary_closing(confirmed, np.ones((3, 3), np.bool_), border_value=0) | confirmed
         room = distance_transform_edt(confirmed) * found.cell
-        at = np.floor((way - found.origin) / found.cell).astype(np.int64)
+        at = np.floor((path - found.origin) / found.cell).astype(np.int64)
         open_ = room[at[:, 1], at[:, 0]] > 0.5 * self.config.trial.vehicle.width
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         ends = np.flatnonzero(~open_ & (length > found.cell))
         seen = float(length[ends[0]]) - found.cell if len(ends) else math.inf
         return min(self.sensor_bound, self.vehicle.safe_speed(seen))

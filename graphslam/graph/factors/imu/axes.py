@@ -127,8 +127,8 @@ def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     turn = se3.so3_log(se3.quat_multiply(_conjugate(q[:-1]), q[1:]))[full] / WINDOW
     ups = R[:, 2, :] * GRAVITY
     rate, force = mean(imu.angular_rate), mean(imu.specific_force)
-    ways = signed_permutations()
-    r = rate - np.einsum("aij,kj->aki", ways, turn)
+    mountings = signed_permutations()
+    r = rate - np.einsum("aij,kj->aki", mountings, turn)
     r -= r.mean(axis=1, keepdims=True)  # the bias
     # a gyro that no permutation brings near the path (degrees for radians) is not used for the attitude
     squares = float((r**2).sum(axis=(1, 2)).min()), float(((rate - rate.mean(axis=0)) ** 2).sum())
@@ -138,9 +138,9 @@ def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     turned = _turned(imu) if believed else np.zeros((len(imu.times), 3))
     ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
     since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
-    since, left = (np.einsum("aji,kj->aki", ways, x) for x in (since, left))  # in the axes of each A
+    since, left = (np.einsum("aji,kj->aki", mountings, x) for x in (since, left))  # in the axes of each A
     up = 0.5 * (ups[:-1][full] - np.cross(since, ups[:-1][full]) + ups[1:][full] + np.cross(left, ups[1:][full]))
-    f = force - np.einsum("aij,akj->aki", ways, up)
+    f = force - np.einsum("aij,akj->aki", mountings, up)
     gyro, pull = (r**2).sum(axis=(1, 2)), (f**2).sum(axis=(1, 2))
     # the residual of the best permutation of each sensor is its noise, with the errors of the path
     rows = 3.0 * len(rate)
@@ -157,7 +157,7 @@ def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     excess = float(chi2[0] - chi2[best])
     alike = int(np.sum(chi2 - chi2[best] <= LIMIT))
     turns = (moved, missed) if unlike else None
-    return AxesCheck(excess > LIMIT and not unlike, ways[best], excess, alike, len(rate), sensor, turns)
+    return AxesCheck(excess > LIMIT and not unlike, mountings[best], excess, alike, len(rate), sensor, turns)
 
 
 def _turned(imu: Imu) -> Array:

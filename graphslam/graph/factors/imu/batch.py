@@ -68,7 +68,7 @@ class PreintegrationArrays:
 
 
 def preintegration_terms(
-    ways: PreintegrationArrays, x_i: Array, v_i: Array, b_i: Array, x_j: Array, v_j: Array, b_j: Array, tilt: Array
+    arrays: PreintegrationArrays, x_i: Array, v_i: Array, b_i: Array, x_j: Array, v_j: Array, b_j: Array, tilt: Array
 ) -> tuple[Array, Array]:
     """Residuals ``(k, 15)`` and Jacobians ``(k, 15, 32)`` on (x_i, v_i, b_i, x_j, v_j, b_j, tilt), not whitened.
 
@@ -79,7 +79,7 @@ def preintegration_terms(
     b_i, b_j : (k, 6)
     tilt : (2,)
     """
-    w, T = ways, ways.T[:, None]
+    w, T = arrays, arrays.T[:, None]
     X_i, X_j = se3_compose(x_i, w.L_i), se3_compose(x_j, w.L_j)
     Rt, E = np.swapaxes(quat_to_matrix(X_i[:, 3:]), 1, 2), None
     E = Rt @ quat_to_matrix(X_j[:, 3:])
@@ -117,7 +117,7 @@ def preintegration_terms(
     return r, J
 
 
-def planar_terms(ways: PreintegrationArrays, *blocks: Array) -> tuple[Array, Array]:
+def planar_terms(arrays: PreintegrationArrays, *blocks: Array) -> tuple[Array, Array]:
     """The same in 2-D: residuals ``(k, 8)`` and Jacobians ``(k, 8, 16)``, the planar components of both.
 
     Parameters
@@ -126,7 +126,7 @@ def planar_terms(ways: PreintegrationArrays, *blocks: Array) -> tuple[Array, Arr
         x_i, v_i, b_i, x_j, v_j, b_j.
     """
     lifted = [lift(word, rows) for (word, _), rows in zip(_BLOCKS, blocks)]
-    r, J = preintegration_terms(ways, *[*lifted, np.zeros(2)])
+    r, J = preintegration_terms(arrays, *[*lifted, np.zeros(2)])
     return r[:, PLANE_ROWS], J[:, PLANE_ROWS[:, None], PLANE_COLUMNS]
 
 

@@ -51,13 +51,13 @@ def required_bias_links(
     states: ImuStates, records: Iterable[Any], stream: str, noise: ImuNoise
 ) -> dict[tuple[int | None, int], Array]:
     """(previous bias or None, bias) → σ ``(6,)``: prior of the first, and walks without a preintegrated measurement."""
-    tied = {r.biases[1] for r in records if isinstance(r, ImuRecord) and r.stream == stream}
+    linked = {r.biases[1] for r in records if isinstance(r, ImuRecord) and r.stream == stream}
     out: dict[tuple[int | None, int], Array] = {}
     for before, node in zip((None, *states.order), states.order):
         b = states.bias[node]
         if before is None:
             out[None, b] = bias_sigma(noise)
-        elif b not in tied:
+        elif b not in linked:
             out[states.bias[before], b] = walk_sigma(noise, states.time[node] - states.time[before])
     return out
 

@@ -121,9 +121,9 @@ def climbs(path: Array, truth: Array, *, slope: float = 0.04, least: float = 1.0
         Shorter climbs are left out [m].
     """
     est, true = relative(path)[:, 2], relative(truth)
-    way = arc_length(true[:, :3])
-    driven = np.gradient(way)
-    steep = np.zeros(len(way))
+    along = arc_length(true[:, :3])
+    driven = np.gradient(along)
+    steep = np.zeros(len(along))
     moving = driven > 1e-3
     steep[moving] = np.gradient(true[:, 2])[moving] / driven[moving]
     side = np.where(np.abs(steep) > slope, np.sign(steep), 0.0)

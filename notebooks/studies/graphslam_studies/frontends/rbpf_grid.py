@@ -253,14 +253,14 @@ def covariance_along_path(steps: Steps, poses: Array, passed: ErrorPassThrough, 
     n = len(poses)
     knots = np.unique(np.linspace(0, n - 1, min(n, KNOTS)).round().astype(np.int64))
     tilt = None if steps.tilt is None else steps.tilt_sigma
-    way = steps.path_length
+    along = steps.path_length
     C = [
         passed.covariance(
-            dead_reckoning_covariance(steps, 0, k, level_end=False), float(way[k] - way[0]), particles, tilt=tilt
+            dead_reckoning_covariance(steps, 0, k, level_end=False), float(along[k] - along[0]), particles, tilt=tilt
         )
         for k in knots.tolist()
     ]
-    return interpolate_covariances(knots, np.array(C), poses, way)
+    return interpolate_covariances(knots, np.array(C), poses, along)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -95,7 +95,7 @@ def plot_expansion(
     DataError
         The sample holds no closed segment.
     """
-    paths, ties, _ = sample_paths(segmap, sample)
+    paths, matches, _ = sample_paths(segmap, sample)
     if not paths:
         raise DataError("a sample without a closed segment", got=len(sample), wanted="≥ 1")
     i, j = ("xyz".index(c) for c in plane)
@@ -108,9 +108,9 @@ def plot_expansion(
         middle = path[len(path) // 2]
         ax.annotate(str(int(d)), (middle[i], middle[j]), xytext=(3, 3), textcoords="offset points",
                     fontsize="x-small", zorder=6)  # fmt: skip
-    for k, tie in enumerate(ties):
-        ax.plot([tie.here[i], tie.there[i]], [tie.here[j], tie.there[j]], color=style.VERMILION, lw=1.2, marker="o",
-                ms=5.0, mfc="none", label=f"matches ({len(ties)})" if k == 0 else None, zorder=5)  # fmt: skip
+    for k, m in enumerate(matches):
+        ax.plot([m.here[i], m.there[i]], [m.here[j], m.there[j]], color=style.VERMILION, lw=1.2, marker="o",
+                ms=5.0, mfc="none", label=f"matches ({len(matches)})" if k == 0 else None, zorder=5)  # fmt: skip
     ax.plot(0.0, 0.0, "s", color=style.BLACK, ms=6, label="frame of the root", zorder=5)
     ax.figure.colorbar(ScalarMappable(norm, cmap), ax=ax, label="links from the root", shrink=0.8)
     style.metric_axes(ax, *plane)

@@ -116,7 +116,7 @@ def sample_paths(
         poses = g.compose(np.broadcast_to(first, poses.shape), poses)
     place = {int(i): k for k, i in enumerate(sample.segments.tolist()) if i != OPEN}
     paths: list[Array] = []
-    ties: list[DrawnMatch] = []
+    matches: list[DrawnMatch] = []
     labels: list[str] = []
     for k in sample.in_time.tolist():
         i = int(sample.segments[k])
@@ -131,8 +131,8 @@ def sample_paths(
         seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
         at = poses[place[s.source]]
         nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
-        ties.append(DrawnMatch(paths[-1][0], placed_segments(at, nearest[None])[0]))
-    return paths, ties, labels
+        matches.append(DrawnMatch(paths[-1][0], placed_segments(at, nearest[None])[0]))
+    return paths, matches, labels
 
 
 def plot_samples(

@@ -155,8 +155,8 @@ def plot_cloud(
         if ax.figure is not None:
             ax.figure.colorbar(dots, ax=ax, label="height [m]", shrink=0.7, pad=0.01)
     if path is not None:
-        way = view.project(np.asarray(path, dtype=np.float64))
-        ax.plot(way[:, 0], way[:, 1], color=style.VERMILION, lw=1.2, label="path", zorder=6)
+        line = view.project(np.asarray(path, dtype=np.float64))
+        ax.plot(line[:, 0], line[:, 1], color=style.VERMILION, lw=1.2, label="path", zorder=6)
         style.legend(ax, outside=False, loc="best")
     _bare(ax, title)
     return ax

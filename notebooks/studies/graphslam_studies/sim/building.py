@@ -231,16 +231,16 @@ def _corridor(mesh: MeshBuilder, leg: _Leg, rng: np.random.Generator) -> None:
 
 def _waypoints() -> list[tuple[float, float, float]]:
     """Up through the levels with all their corridors, down again, and out to where the first corridor begins."""
-    way: list[tuple[float, float, float]] = [(_LANE, -6.0, 0.0)]
+    points: list[tuple[float, float, float]] = [(_LANE, -6.0, 0.0)]
     for level in range(_LEVELS):
         z = level * STOREY
         east, north, west = (leg for leg in _LEGS if leg.level == level)
-        way += [(_LANE, 0.0, z), *east.way(), (0.0, 0.0, z), *north.way(), (0.0, 0.0, z), *west.way()]
+        points += [(_LANE, 0.0, z), *east.way(), (0.0, 0.0, z), *north.way(), (0.0, 0.0, z), *west.way()]
         if level < _LEVELS - 1:
-            way += [(-_LANE, 0.0, z), *_climb(level)]
+            points += [(-_LANE, 0.0, z), *_climb(level)]
     for level in range(_LEVELS - 2, -1, -1):
-        way += [(_LANE, 0.0, (level + 1) * STOREY), *_climb(level)[::-1], (-_LANE, 0.0, level * STOREY)]
-    return [*way, (16.5, 0.0, 0.0)]
+        points += [(_LANE, 0.0, (level + 1) * STOREY), *_climb(level)[::-1], (-_LANE, 0.0, level * STOREY)]
+    return [*points, (16.5, 0.0, 0.0)]
 
 
 def _climb(level: int) -> list[tuple[float, float, float]]:

@@ -56,9 +56,9 @@ class Balancing(RouteMotion):
     """
 
     def __init__(
-        self, way: SampledRoute, speed: float, config: DriveConfig, lean: float, rate: float, tree: SeedTree
+        self, route: SampledRoute, speed: float, config: DriveConfig, lean: float, rate: float, tree: SeedTree
     ) -> None:
-        super().__init__(way, speed, config)
+        super().__init__(route, speed, config)
         rng = tree.generator()
         share = rng.dirichlet(np.ones(_LEANS))
         self._amplitude = lean * share
@@ -83,9 +83,9 @@ class Balancing(RouteMotion):
 def campus_motion(world: World, config: CampusConfig, tree: SeedTree) -> Balancing:
     """The true motion of the robot's base, the middle of its axle, in the frame of the world."""
     drive = DriveConfig(rate=config.imu_rate, wheelbase=0.6)
-    way = smooth_route(sample_route(world.route()), drive.wheelbase)
-    way = replace(way, positions=way.positions + [0.0, 0.0, config.axle])
-    return Balancing(way, world.speed, drive, config.lean, config.lean_rate, tree.child("balance"))
+    route = smooth_route(sample_route(world.route()), drive.wheelbase)
+    route = replace(route, positions=route.positions + [0.0, 0.0, config.axle])
+    return Balancing(route, world.speed, drive, config.lean, config.lean_rate, tree.child("balance"))
 
 
 def sensors_of(config: CampusConfig, drawn: dict[str, float]) -> CrawlerConfig:

@@ -197,15 +197,15 @@ def plan_session(campus: Campus, config: CampusConfig, seed: int) -> tuple[Array
     for a, b in pairwise(here):
         if a[0] != "crossing" and b[0] != "crossing" and a[1:] == b[1:]:
             block = next(x for x in blocks if (x.column, x.row) == a[1:])
-            way = block.passage(campus.street)
-            points.extend((way if a[0] == "A" else way[::-1])[:-1])
+            path = block.passage(campus.street)
+            points.extend((path if a[0] == "A" else path[::-1])[:-1])
         else:
             points.append(np.append(net.places[a], 0.0))
     points.append(np.append(net.places[here[-1]], 0.0))
-    way = np.array(points)
+    path = np.array(points)
     # doors of two blocks may face each other across a street, at one place on its middle line
-    moved = np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1) > 1e-6
-    return way[np.append(True, moved)], visited
+    moved = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) > 1e-6
+    return path[np.append(True, moved)], visited
 
 
 class _Net:
@@ -220,9 +220,9 @@ class _Net:
         }
         for b in campus.blocks:
             if b.open and b.row in rows:
-                way = b.passage(campus.street)
-                self.places["A", b.column, b.row] = way[0, :2]
-                self.places["B", b.column, b.row] = way[-1, :2]
+                path = b.passage(campus.street)
+                self.places["A", b.column, b.row] = path[0, :2]
+                self.places["B", b.column, b.row] = path[-1, :2]
         self.next: dict[Node, list[Node]] = {n: [] for n in self.places}
         for axis, lines in ((0, campus.xs), (1, campus.ys[low : high + 1])):
             for at in lines:
@@ -236,14 +236,14 @@ class _Net:
         """As the crow flies [m]."""
         return float(np.linalg.norm(self.places[a] - self.places[b]))
 
-    def go(self, way: list[Node], goal: Node) -> None:
+    def go(self, path: list[Node], goal: Node) -> None:
         """Lengthen a way to a goal along the streets without turning back on itself."""
-        if way[-1] == goal:
+        if path[-1] == goal:
             return
-        before = way[-2] if len(way) > 1 else None
+        before = path[-2] if len(path) > 1 else None
         # out of a door the way may go to either side of the street
-        came = before if before is not None and way[-1] in self.next.get(before, []) else None
-        start = (way[-1], came)
+        came = before if before is not None and path[-1] in self.next.get(before, []) else None
+        start = (path[-1], came)
         queue: list[tuple[float, int, Node, Node | None]] = [(0.0, 0, *start)]
         best: dict[tuple[Node, Node | None], float] = {start: 0.0}
         parent: dict[tuple[Node, Node | None], tuple[Node, Node | None]] = {}
@@ -256,7 +256,7 @@ class _Net:
                 while state != start:
                     found.append(state[0])
                     state = parent[state]
-                way.extend(found[::-1])
+                path.extend(found[::-1])
                 return
             if d > best[node, last]:
                 continue
@@ -268,4 +268,4 @@ class _Net:
                     best[key], parent[key] = cost, (node, last)
                     count += 1
                     heapq.heappush(queue, (cost, count, n, node))
-        raise ConfigError(f"campus: no way from {way[-1]} to {goal} without turning back")
+        raise ConfigError(f"campus: no way from {path[-1]} to {goal} without turning back")

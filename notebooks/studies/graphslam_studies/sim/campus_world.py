@@ -55,7 +55,7 @@ def campus(config: CampusConfig, *, seed: int = 0) -> World:
     mesh = MeshBuilder()
     edge = 30.0
     mesh.box((-edge, -edge, -1.0), (config.size[0] + edge, config.size[1] + edge, 0.0))
-    ways = _ways(plan)
+    paths = _ways(plan)
     for b in plan.blocks:
         rng = tree.child("block", b.column, b.row).generator()
         if b.open:
@@ -63,8 +63,8 @@ def campus(config: CampusConfig, *, seed: int = 0) -> World:
         else:
             _closed_buildings(mesh, b, rng)
     for k, (a, c) in enumerate(plan.streets()):
-        near = np.abs((ways[:, :2] - a) @ np.array([a[1] - c[1], c[0] - a[0]])) < config.street * np.linalg.norm(c - a)
-        _street(mesh, a, c, config, KeepClear(ways[near], _CLEAR), tree.child("street", k).generator())
+        near = np.abs((paths[:, :2] - a) @ np.array([a[1] - c[1], c[0] - a[0]])) < config.street * np.linalg.norm(c - a)
+        _street(mesh, a, c, config, KeepClear(paths[near], _CLEAR), tree.child("street", k).generator())
     waypoints, visited = plan_session(plan, config, seed)
     route = plan_route(waypoints, CORNER_RADIUS, where="campus")
     vertices, triangles = mesh.build()

@@ -161,16 +161,16 @@ class Laps:
         c, R, p = self.config, self.truth.rotation, self.truth.position
         rng = SeedTree(self.seed).child("laps", "motion").generator()
         N = c.poses
-        turn, way = c.odometry
+        turn, shift = c.odometry
         Q = quat_to_matrix(so3_exp(turn * rng.standard_normal((N - 1, 3))))
         dR = np.matmul(np.matmul(R[:-1].swapaxes(1, 2), R[1:]), Q)
-        dp = np.einsum("nji,nj->ni", R[:-1], np.diff(p, axis=0)) + way * rng.standard_normal((N - 1, 3))
+        dp = np.einsum("nji,nj->ni", R[:-1], np.diff(p, axis=0)) + shift * rng.standard_normal((N - 1, 3))
         up = R[:, 2, :] + c.up_sigma * rng.standard_normal((N, 3))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         per = self.shared.shape[0]
         at = np.arange(0, N, c.gps_every)
         at = at[(at % per < per // 2) & (at // per < c.gps_laps)]
-        cov = np.diag([turn**2] * 3 + [way**2] * 3)
+        cov = np.diag([turn**2] * 3 + [shift**2] * 3)
         return SkeletonProblem(
             points=self.points() if points is None else points,
             landmark=self.collapsed()[0] if landmark is None else landmark,

@@ -118,8 +118,8 @@ def _sky(rng: np.random.Generator, times: Array, path: Array, c: SatelliteConfig
     clock = -1.4e5 + np.concatenate([[0.0], np.cumsum(walk)])
     systems = np.where(np.arange(m) % 3 == 2, 4, 1)
     offset = np.where(systems == 4, 4.0 * rng.standard_normal(), 0.0)
-    way = np.linalg.norm(path[:, None, :3] - there, axis=2)
-    seen = way + clock[:, None] + offset + bias + c.sigma * growth * rng.standard_normal((n, m))
+    distance = np.linalg.norm(path[:, None, :3] - there, axis=2)
+    seen = distance + clock[:, None] + offset + bias + c.sigma * growth * rng.standard_normal((n, m))
     return Pseudoranges(
         times=times,
         offsets=m * np.arange(n + 1),

@@ -422,7 +422,7 @@ def drive_street(
         yaw = -0.5 * np.pi
     z = street.base(x, y)
     rise = np.gradient(z, 0.02)
-    way = SampledRoute(
+    route = SampledRoute(
         step=0.02,
         positions=np.column_stack([x, y, z]),
         yaw=np.full(len(x), yaw),
@@ -430,7 +430,7 @@ def drive_street(
         roll=np.zeros(len(x)),
     )
     config = DriveConfig(rate=100.0, ramp=0.5, stand=robot.stand)
-    motion = Balancing(way, robot.speed, config, math.radians(robot.lean), 1.0, tree.child("lean"))
+    motion = Balancing(route, robot.speed, config, math.radians(robot.lean), 1.0, tree.child("lean"))
     count = int((motion.duration - 1.0 / robot.line_rate) * robot.line_rate)
     scans = robot.scans(np.arange(count) / robot.line_rate, panning=aside is None)
     cast = cast_scans(scans, motion, RayCaster(*street.mesh()), robot.noise(), tree.child("beams"))

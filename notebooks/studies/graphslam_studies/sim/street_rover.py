@@ -120,17 +120,17 @@ class StreetRover:
 
     def _follow(self, state: RoverState, command: Command, steps: int, *, beyond: int) -> tuple[RoverState, Array]:
         """State after some steps, and planar poses of these and a few more ``(steps + beyond, 3)``."""
-        way = command.way
-        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+        path = command.way
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         along, v, yaw = state.along, state.speed, state.yaw
         out, new = np.empty((steps + beyond, 3)), state
         for k in range(steps + beyond):
-            x, y = np.interp(along, lengths, way[:, 0]), np.interp(along, lengths, way[:, 1])
+            x, y = np.interp(along, lengths, path[:, 0]), np.interp(along, lengths, path[:, 1])
             if k == steps:
                 new = RoverState(state.time + steps * _DT, np.array([x, y]), yaw, v, along)
             out[k] = x, y, yaw
             ahead = min(along + _AHEAD, lengths[-1])
-            to = np.interp(ahead, lengths, way[:, 0]) - x, np.interp(ahead, lengths, way[:, 1]) - y
+            to = np.interp(ahead, lengths, path[:, 0]) - x, np.interp(ahead, lengths, path[:, 1]) - y
             turn = 0.0
             if math.hypot(*to) > 1e-3:
                 turn = (math.atan2(to[1], to[0]) - yaw + math.pi) % (2.0 * math.pi) - math.pi
