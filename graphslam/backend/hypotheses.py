@@ -24,7 +24,7 @@ from graphslam.core.progress import Bar
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.loops.candidates import TIE
+from graphslam.loops.candidates import OVERLAP
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.graph_loops import GraphLoops
 from graphslam.loops.ledger import LoopDecision
@@ -112,7 +112,7 @@ def choices_of_matches(
         found[f"support ≥ {least:.2g}"] = at_least | found_loops
     for key, i in sorted(matches):
         found[f"without {key} → {every[key, i].target}"] = own - {(key, i)}
-    alone = [d for d in loops if d.source != TIE]
+    alone = [d for d in loops if d.source != OVERLAP]
     for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # largest χ² first
         found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
     needs = {(LOOP, d.loop): overlap_entries(d.gates) for d in loops}

@@ -275,7 +275,7 @@ def refinement_findings(
     if r.other is not None and r.other.apart > r.rounds[-1].distance:
         text = (
             f"refinement from two initial paths: {r.other.apart:.2f} m apart — the one from the "
-            f"{'odometry' if r.other.taken else 'graph'} was kept, its scans agree better ({r.other.kept:.1%} of the "
+            f"{'odometry' if r.other.swapped else 'graph'} was kept, its scans agree better ({r.other.kept:.1%} of the "
             f"points, the other {r.other.left:.1%}). Check the map."
         )
         out.append(Finding("look", "refine-two-paths", text))

@@ -160,7 +160,7 @@ class ConnectedSession:
     ----------
     known : DenseSession
         The session that it is attached to.
-    ties : InterSessionLoops or None
+    candidates : InterSessionLoops or None
         Candidates by appearance; None if GPS gave the alignment.
     used : list of Loop
         Loop closures in the final graph, with those by proximity; nodes of the graph.
@@ -170,7 +170,7 @@ class ConnectedSession:
 
     first_node: int
     known: DenseSession
-    ties: InterSessionLoops | None
+    candidates: InterSessionLoops | None
     used: list[Loop]
     dropped: int
 

@@ -36,7 +36,7 @@ def profile_clock(s: Smoothing, seen: ObservationLog) -> Estimate:
     def score(k: int) -> float:
         if k not in scores:
             moved = L.shift_motion(s, seen, k * period)
-            moved.settle(8)
+            moved.converge(8)
             moved.fit(rounds=1)
             scores[k] = moved.objective()
         return scores[k]

@@ -12,7 +12,7 @@ from graphslam.calibrate.corrections import Corrections
 from graphslam.core.config import options_dict
 from graphslam.core.findings import Finding
 
-SURE = 3.0
+SIGNIFICANT = 3.0
 """A constant is applied if it differs from its neutral value by more than this many σ,"""
 GAIN = 5.0
 """… increases the log-likelihood by more than this over a fit without it [nats],
@@ -68,12 +68,12 @@ class Estimate:
         """Is it significantly larger than the plausible limit in :data:`LARGEST`?"""
         if self.name.endswith("_scale") and self.sigma > VAGUE:
             return False
-        return abs(self.value) - SURE * self.sigma > LARGEST.get(self.name, math.inf)
+        return abs(self.value) - SIGNIFICANT * self.sigma > LARGEST.get(self.name, math.inf)
 
     def gated(self) -> Estimate:
         """Copy with ``why_not`` set by the acceptance tests."""
         why = ""
-        if not abs(self.value) > SURE * self.sigma:
+        if not abs(self.value) > SIGNIFICANT * self.sigma:
             why = "not significant"
         elif self.name.endswith("_scale") and self.sigma > VAGUE:
             why = f"an uncertainty of ± {100 * self.sigma:.0f} % is too large for a scale"

@@ -35,7 +35,7 @@ from graphslam.calibrate.residual_kernels import (
 )
 from graphslam.core.jit import njit
 
-Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "gone", "pivots", "order", "when", "at"])
+Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "rows", "pivots", "order", "when", "at"])
 """Output of :func:`eliminate_window`."""
 _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
 _FAR = 1e-8  # prior information of a landmark position [1/m²]
@@ -115,7 +115,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     p : (PARAMETERS,) standard deviations.
     damping : Levenberg-Marquardt factor; diagonals of poses and nuisances are multiplied by 1 + damping.
     work : Work
-        L (n, D, D), X (n, D, D), C (n, D, m), S (m, m), chi2 (6,), gone (2 M, m + D), pivots (2 M,), order (M,),
+        L (n, D, D), X (n, D, D), C (n, D, m), S (m, m), chi2 (6,), rows (2 M, m + D), pivots (2 M,), order (M,),
         when (M,), at (M,): output for :func:`substitute_window`; m = HEAD + 2 · maximal number of active nuisances.
         ``order`` lists the nuisances in elimination order, ``when`` the pose of each elimination, ``at`` the index in
         the border. S[:HEAD, :HEAD] is the information of the constants, with the right-hand side and χ² in row RHS;

@@ -13,7 +13,7 @@ import numpy as np
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections
-from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
+from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SIGNIFICANT, Calibration, Estimate, round_digits
 from graphslam.calibrate.prediction_check import predict_withheld_observations
 from graphslam.calibrate.slips import ROUNDS, find_slips, slip_finding, with_untested
 from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, SmoothingWindow, rebuild_window
@@ -216,7 +216,7 @@ def cross_check_windows(s: Smoothing, value: float, other: Smoothing) -> tuple[l
     for name in first.free:
         i = CONSTANTS.index(name)
         gain = math.nan
-        if abs(s.constants[i]) > SURE * sd[i]:
+        if abs(s.constants[i]) > SIGNIFICANT * sd[i]:
             alone, alone_value = L.fit_without(s, name)
             gain = alone_value - value
             if gain < 0.0:

@@ -53,7 +53,7 @@ def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
 
 def fit_noise(s: Smoothing, *, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
     """Fit, trim and fit again; the smoothing and its objective."""
-    s.settle(8)
+    s.converge(8)
     s = trim_outliers(s, 12.0)  # a false association by metres would inflate the noise of all
     value = s.fit(rounds=2 if trims else 4)
     for limit in trims:
@@ -111,7 +111,7 @@ def smooth_ranges(seen: ObservationLog, until: float, *, seed: int = 0) -> tuple
             w = _part(whole, path, places, rng)
             one = smoothing_of([w], s.T_base_sensor, free)
             one.constants, one.sigmas = g, {**sigmas, "range": max(sigmas["range"], 1.0)}
-            tries.append((one.settle(60), one))
+            tries.append((one.converge(60), one))
         best = min(tries, key=lambda x: x[0])[1]
         best.fit(rounds=2)
         best = trim_outliers(best, 5.0)

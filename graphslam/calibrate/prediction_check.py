@@ -21,7 +21,7 @@ from graphslam_frontends.odometry.motion import MotionNoise
 
 TRIM = 4.0
 """Observations with a larger residual are ignored for both [σ, the larger one of log and estimate]."""
-SETTLE = 12
+ITERATIONS = 12
 
 
 def predict_withheld_observations(
@@ -64,15 +64,15 @@ def predict_withheld_observations(
         s = _smoothing(seen.mended(c), scans, start, visits=own["visit_range"] > 0.0)
         if kept is None:
             s.sigmas |= {k: max(own[k], stated[k]) for k in ("range", "bearing")}
-            s.settle(SETTLE)
+            s.converge(ITERATIONS)
             s = trim_outliers(s, TRIM)
             kept = np.concatenate([w.rows for w in s.windows]) if s.windows else np.zeros(0, dtype=np.int64)
         else:
             s = keep_observations(s, [np.isin(w.rows, kept) for w in s.windows])
         s.sigmas |= {k: v for k, v in own.items() if v > 0.0}
-        s.settle(SETTLE)
+        s.converge(ITERATIONS)
         rest = keep_observations(s, [~hidden[w.rows] for w in s.windows])
-        rest.settle(SETTLE)
+        rest.converge(ITERATIONS)
         n = sum(int(hidden[w.rows].sum()) for w in s.windows)
         return s.objective() - rest.objective() + n * math.log(c.range_scale), n
 

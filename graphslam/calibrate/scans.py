@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import gammaln
 
-from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate, Prediction
+from graphslam.calibrate.estimate import AGREE, NAMES, SIGNIFICANT, Calibration, Estimate, Prediction
 from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibration_of
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
@@ -343,7 +343,7 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
     for k, name in enumerate(names):
         sd = math.sqrt(full.covariance[k, k])
         gain = math.nan
-        if abs(full.value[k]) > SURE * sd:
+        if abs(full.value[k]) > SIGNIFICANT * sd:
             others = np.column_stack([columns[n] for n in names if n != name] or [p.metres[:, None][:, :0]])
             gain = regress_errors(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
         out.append(_gated(name, full, parts, k, gain))
@@ -367,7 +367,7 @@ def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
     full = regress_errors(p.along, A, grows)
     parts = [regress_errors(p.along[m], A[m], grows[m]) for m in (p.apart == p.apart.min(), p.apart == p.apart.max())]
     gain = math.nan
-    if abs(full.value[0]) > SURE * math.sqrt(full.covariance[0, 0]):
+    if abs(full.value[0]) > SIGNIFICANT * math.sqrt(full.covariance[0, 0]):
         keep = full.keep
         gain = regress_errors(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
     raw = _gated("distance_scale", full, parts, 0, gain)

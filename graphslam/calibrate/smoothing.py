@@ -232,7 +232,7 @@ class Smoothing:
             out.append(np.array(gain))
         return out
 
-    def settle(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
+    def converge(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
         """Gauss-Newton, with Levenberg-Marquardt damping after a failed step; returns χ²."""
         p, damping, value = self._parameters(), 0.0, np.inf
         i = self._index
@@ -277,7 +277,7 @@ class Smoothing:
         Each round minimises the objective of the problem linearised at the states, then updates the states with the
         standard deviations found.
         """
-        self.settle()
+        self.converge()
         names = list(self.fitted)
         value = self.objective()
         for _ in range(rounds if names else 0):
@@ -304,7 +304,7 @@ class Smoothing:
             )
             moved = found.x / scale
             self.sigmas.update(dict(zip(names, np.exp(x0 + moved).tolist())))
-            self.settle(6)
+            self.converge(6)
             before, value = value, self.objective()
             if before - value < 10.0 * tolerance and float(np.max(np.abs(moved))) < 0.1:
                 break

@@ -25,7 +25,7 @@ from typing import Any
 
 import platformdirs
 
-from graphslam.core.progress import say_compiling
+from graphslam.core.progress import show_compiling
 
 
 @contextmanager
@@ -66,13 +66,13 @@ class _Compilations(event.Listener):
         self._depth += 1
         if self._depth == 1:
             self._since = time.perf_counter()
-            say_compiling(True)
+            show_compiling(True)
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._since
-            say_compiling(False)
+            show_compiling(False)
 
 
 _compilations = _Compilations()

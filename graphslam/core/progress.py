@@ -80,7 +80,7 @@ class Bar(tqdm):
         except (OSError, ValueError):
             self.disable = True
 
-    def say(self, text: str) -> None:
+    def note(self, text: str) -> None:
         """Write a note after the bar immediately."""
         if not self.disable:
             self.set_postfix_str(printable(text))
@@ -93,11 +93,11 @@ def shown_bars() -> list[Bar]:
         return sorted(bars, key=lambda b: abs(b.pos))
 
 
-def say_compiling(now: bool) -> None:
+def show_compiling(now: bool) -> None:
     """Show or remove the compilation note in the first bar."""
     for bar in shown_bars()[:1]:
         if now:
-            bar.say(COMPILING)
+            bar.note(COMPILING)
         elif bar.postfix == COMPILING:
             bar.set_postfix_str("", refresh=False)
 
@@ -106,9 +106,9 @@ def say_compiling(now: bool) -> None:
 def compiling() -> Iterator[None]:
     """Show that kernels are compiled, in the current bar or in a new one."""
     if shown_bars():
-        say_compiling(True)
+        show_compiling(True)
         yield
-        say_compiling(False)
+        show_compiling(False)
         return
     with Bar(name=COMPILING, bar_format="{desc}"):
         yield

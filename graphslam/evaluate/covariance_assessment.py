@@ -42,7 +42,7 @@ LEAST_POWER = 0.8
 """Least power against covariances that are too small by :data:`HALF` for the verdict *consistent*."""
 DETECTABLE_VARIANCE_RATIO = 1.5
 """Ratio of true to reported variances that a test must exclude."""
-SURE = 0.975
+CONFIDENCE = 0.975
 """Confidence with which it is excluded."""
 MAX_NONLINEARITY = 0.006
 """Squared shift by curvature per unknown, mean over submaps, above which the verdict is *not tested*. In 80 simulated
@@ -84,7 +84,7 @@ class ConsistencyTest:
     @property
     def upper(self) -> float:
         """Largest ratio of true to reported variances that the test does not exclude."""
-        return self.value * self.dof / max(chi2_quantile(1.0 - SURE, self.dof), 1e-12)
+        return self.value * self.dof / max(chi2_quantile(1.0 - CONFIDENCE, self.dof), 1e-12)
 
     def power(self, tests: int) -> float:
         """Probability that this test, one of ``tests``, detects covariances that are too small by :data:`HALF`."""

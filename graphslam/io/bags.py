@@ -116,7 +116,7 @@ def read_bag(
         bag = BagFiles(p, stack)
         chosen = choose_topics(bag, asked, notes, counter)
         frames, rows, spool = collect_messages(bag, chosen, counter)
-    frames.settle()
+    frames.fix_constant()
     made, streams = _BagLog(str(p), rows, frames, counter, notes), dict[str, Stream]()
     if "odometry" not in rows and topics.odometry != "none" and (moving := made.moving(frame_asked)) is not None:
         rows["odometry"] = moving

@@ -63,7 +63,7 @@ class FrameTree:
                 rows.bag_stamps.append(bag_stamp)
                 rows.values.append(pose)
 
-    def settle(self) -> None:
+    def fix_constant(self) -> None:
         """Treat transforms of ``tf`` that never changed as fixed, except from odometry frames."""
         for key, rows in list(self.moving.items()):
             if np.ptp(np.array(rows.values), axis=0).max() == 0.0 and leaf(key[0]) not in ODOMETRY_FRAMES:

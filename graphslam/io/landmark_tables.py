@@ -72,7 +72,7 @@ class Header:
         Number of columns.
     line : int
         Line number of the header, counted from 1.
-    said : str
+    text : str
         Text of the header.
     """
 
@@ -80,7 +80,7 @@ class Header:
     separator: str | None
     width: int
     line: int
-    said: str
+    text: str
 
     @property
     def odometry(self) -> str:
@@ -254,7 +254,7 @@ def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Arra
         raise FormatError(
             f"{short} of {short + len(rows)} rows have not the {header.width} values of the header",
             where=str(path),
-            got=header.said,
+            got=header.text,
             wanted="one value a column",
         )
     out = {}

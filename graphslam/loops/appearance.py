@@ -77,17 +77,17 @@ def appearance_candidates(
     covariance = _covariance(c, g.dim)
     found: list[LoopCandidate] = []
     for j in range(len(places)):
-        if places.way[j] < c.least_way:
+        if places.arc[j] < c.least_way:
             continue
         rows = np.sort(tree.query(keys[j], min(descriptors.config.shortlist, len(places)))[1]).astype(np.int64)
-        usable = places.way[j] - places.way[rows] >= c.least_way
+        usable = places.arc[j] - places.arc[rows] >= c.least_way
         usable &= places.submap[rows] != places.submap[j]
         usable &= [tuple(sorted((int(s), int(places.submap[j])))) not in shut for s in places.submap[rows]]
         rows = rows[usable]
         if not len(rows):
             continue
         correlation, turn = descriptor_similarity(descriptors, j, descriptors, rows)
-        best = _stretches(places.way[rows], correlation, c.stretch, c.top + 1)
+        best = _stretches(places.arc[rows], correlation, c.stretch, c.top + 1)
         # the best ones together must lead over the next stretch; otherwise this place looks like many others
         beaten = float(correlation[best[c.top]]) if len(best) > c.top else -1.0
         for k in best[: c.top]:
@@ -134,7 +134,7 @@ def _thinned(places: Places, found: list[LoopCandidate], stretch: float) -> list
     kept: list[LoopCandidate] = []
     for x in found:
         if all(
-            abs(places.way[x.i] - places.way[y.i]) >= stretch or abs(places.way[x.j] - places.way[y.j]) >= stretch
+            abs(places.arc[x.i] - places.arc[y.i]) >= stretch or abs(places.arc[x.j] - places.arc[y.j]) >= stretch
             for y in kept
         ):
             kept.append(x)

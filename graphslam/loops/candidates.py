@@ -24,7 +24,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.loops.places import Ints, Places, RelativePoses
 
-FRONT_END, PROXIMITY, APPEARANCE, TIE = "front-end", "proximity", "appearance", "tie"
+FRONT_END, PROXIMITY, APPEARANCE, OVERLAP = "front-end", "proximity", "appearance", "tie"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +157,7 @@ def proximity_candidates(
     c = CandidateConfig() if config is None else config
     n = len(places)
     first, second = np.triu_indices(n, 1)
-    far = places.way[second] - places.way[first] >= c.least_way
+    far = places.arc[second] - places.arc[first] >= c.least_way
     # places of one submap are no pair: the map would be matched with itself
     far &= (places.submap[first] != places.submap[second]) & (places.submap[second] >= since)
     if exclude:
@@ -182,8 +182,8 @@ def proximity_candidates(
     if not kept:
         return []
     ends_i, ends_j, T, P, gain, score = (np.concatenate([part[k] for part in kept]) for k in range(6))
-    before = [(int(places.submap[p]), float(places.way[q])) for p, q in tried]
-    chosen = thin_candidates(places.submap[ends_i], places.way[ends_j], score, c.stretch, c.keep, before)
+    before = [(int(places.submap[p]), float(places.arc[q])) for p, q in tried]
+    chosen = thin_candidates(places.submap[ends_i], places.arc[ends_j], score, c.stretch, c.keep, before)
     return [
         LoopCandidate(
             i=int(ends_i[k]),

@@ -36,7 +36,7 @@ OUTNUMBERED = 4
 
 AMBIGUOUS = "ambiguous"
 """Start of the reason of loops that are undecided …"""
-SETTLED = ("dispute", AMBIGUOUS)
+LOST = ("dispute", AMBIGUOUS)
 """… and of all loops that lost a dispute."""
 
 Outcome = Literal["stays", "changes", "ambiguous"]

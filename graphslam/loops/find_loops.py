@@ -184,9 +184,9 @@ class LoopSearch:
             # a dense submap without a map raises an error there; landmark submaps have no map
             view = None if s.landmarks is not None and not has_dense_view(s) else measurer.prepared(k).view
             parts.append(describe_places(view, p.T_base_node[p.of_submap(k)], c.descriptors))
-        seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
+        seen = {(int(p.submap[i]), round(float(p.arc[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
-        go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
+        go([x for x in alike if (int(p.submap[x.i]), round(float(p.arc[x.j]), 1)) not in seen])
 
 
 def _believed(closer: LoopCloser) -> set[Entry]:

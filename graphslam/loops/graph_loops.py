@@ -15,7 +15,7 @@ from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
-from graphslam.loops.candidates import TIE
+from graphslam.loops.candidates import OVERLAP
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
 
@@ -99,7 +99,7 @@ class GraphLoops:
         """Add a between-factor as declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
         used = EvidenceUse(["match"], s.interval, "shared-scan")
-        g = TIE if loop.source == TIE else GROUP
+        g = OVERLAP if loop.source == OVERLAP else GROUP
         return self.graph.add_between(loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=g)
 
     def remove_loop(self, factor_id: int) -> None:

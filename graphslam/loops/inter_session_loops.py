@@ -199,7 +199,7 @@ class TwoSessions:
             np.concatenate([a.node, self.offset + b.node]),
             np.concatenate([a.submap, len(known.submaps) + b.submap]),
             np.concatenate([a.T_base_node, b.T_base_node]),
-            np.concatenate([a.way, known.length + _APART + b.way]),
+            np.concatenate([a.arc, known.length + _APART + b.arc]),
             np.concatenate([a.time, b.time]),
         )
         self.measurer = LoopMeasurer([*known.submaps, *new.submaps], self.places, pairs)
@@ -266,7 +266,7 @@ class TwoSessions:
             others = np.flatnonzero(~best.accepted)
             if len(others):
                 rival = int(largest_consistent_set(D[np.ix_(others, others)], limit, against_chain=False).clique.sum())
-            along = self.new.places.way[self._rows([x for x, yes in zip(loops, accepted) if yes])]
+            along = self.new.places.arc[self._rows([x for x, yes in zip(loops, accepted) if yes])]
             reach = float(np.ptp(along))
         n = int(accepted.sum())
         counts = f"{len(loops)} places looked alike, {len(good)} of them passed the registration, {n} agree"
@@ -297,7 +297,7 @@ class TwoSessions:
         if not loops:
             return []
         target = self.known.places.submap[[x.i for x in loops]]
-        along = self.new.places.way[[x.j for x in loops]]
+        along = self.new.places.arc[[x.j for x in loops]]
         chosen = thin_candidates(target, along, np.array([x.score for x in loops]), stretch, len(loops))
         return [loops[k] for k in sorted(chosen)]
 

@@ -37,7 +37,7 @@ from graphslam.graph.noise import RobustKernel
 from graphslam.loops.conflicting_groups import (
     AMBIGUOUS,
     CLASH,
-    SETTLED,
+    LOST,
     SHUTS_OUT,
     choose_group,
     find_conflicting_groups,
@@ -173,7 +173,7 @@ class LoopCloser:
             if self._disputes():
                 self._reconsider()
                 if self.map_check is not None:
-                    resolved = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
+                    resolved = {d.loop for d in self.ledger.current() if d.why.startswith(LOST)}
                     self._round([], resolved)
                     self._reconsider()
         self._report_weights()

@@ -13,7 +13,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.evidence.views import dense_view
-from graphslam.loops.candidates import FRONT_END, TIE, LoopCandidate
+from graphslam.loops.candidates import FRONT_END, OVERLAP, LoopCandidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
@@ -103,7 +103,7 @@ class LoopMeasurer:
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])
         keys = (self.submaps[a].key, self.submaps[b].key)
-        if c.source in (FRONT_END, TIE):
+        if c.source in (FRONT_END, OVERLAP):
             return Loop(
                 i=c.i, j=c.j, T_ij=c.T_ij, covariance=c.covariance, source=c.source, score=c.score, gain=c.gain,
                 gates=dict(c.facts), submaps=keys,

@@ -25,7 +25,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
 from graphslam.core.submap import Submap
-from graphslam.loops.candidates import TIE, LoopCandidate
+from graphslam.loops.candidates import OVERLAP, LoopCandidate
 from graphslam.loops.places import Places
 
 Entry = tuple[int, int]
@@ -93,8 +93,8 @@ def overlap_candidates(
         mine = places.of_submap(k)
         last = -math.inf
         for j in mine[1:].tolist():  # the base is the place of the entry itself
-            length = float(places.way[j])
-            if length - max(last, float(places.way[mine[0]])) < c.spacing:
+            length = float(places.arc[j])
+            if length - max(last, float(places.arc[mine[0]])) < c.spacing:
                 continue
             found = _beside(places, j, seen[k], c)
             if found is None:
@@ -103,7 +103,7 @@ def overlap_candidates(
             last = length
             out.append(
                 LoopCandidate(
-                    i=i, j=j, source=TIE, T_ij=T, covariance=c.covariance(group_of(T)), gain=math.nan, score=1.0,
+                    i=i, j=j, source=OVERLAP, T_ij=T, covariance=c.covariance(group_of(T)), gain=math.nan, score=1.0,
                     facts={"entries": [list(e) for e in by]},
                 )
             )  # fmt: skip
@@ -148,7 +148,7 @@ def _beside(places: Places, j: int, seen: _Seen, c: OverlapConfig) -> tuple[int,
     for u, (T_u_base, by) in seen.items():
         T_u_j = g.compose(T_u_base, T_j)
         at = places.of_submap(u)
-        at = at[places.way[j] - places.way[at] >= c.least_way]
+        at = at[places.arc[j] - places.arc[at] >= c.least_way]
         d = places.T_base_node[at, : g.dim] - T_u_j[: g.dim]
         near = np.hypot(d[:, 0], d[:, 1])
         if g.dim == 3:

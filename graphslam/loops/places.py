@@ -1,6 +1,6 @@
 """Places of a chain of submaps between which loops are possible: nodes at regular distances.
 
-A place is a node of the graph: the base of a submap, or a pose of its path. ``way`` is the path length along the whole
+A place is a node of the graph: the base of a submap, or a pose of its path. ``arc`` is the path length along the whole
 chain, which distinguishes stretches. The relative pose of two places with its covariance comes from the graph
 (:class:`RelativePoses`).
 """
@@ -43,7 +43,7 @@ class Places:
         Number of the submap of each in the chain.
     T_base_node : (n, 7) or (n, 3)
         In the frame of that submap's base.
-    way : (n,)
+    arc : (n,)
         Path length from the start of the chain [m].
     time : (n,)
         Time of the body at the place [s].
@@ -52,16 +52,16 @@ class Places:
     node: Ints
     submap: Ints
     T_base_node: Array
-    way: Array
+    arc: Array
     time: Array
 
     def __post_init__(self) -> None:
         n = len(self.node)
-        sizes = tuple(map(len, (self.node, self.submap, self.T_base_node, self.way, self.time)))
+        sizes = tuple(map(len, (self.node, self.submap, self.T_base_node, self.arc, self.time)))
         if len(set(sizes)) != 1:
             raise GeometryError("places differ in number", got=sizes)
         group_of(self.T_base_node)  # refuses other shapes
-        if n and np.any(np.diff(self.way) < 0):
+        if n and np.any(np.diff(self.arc) < 0):
             raise DataError("places are not in the order of the path", wanted="rising lengths")
 
     def __len__(self) -> int:

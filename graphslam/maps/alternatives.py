@@ -58,7 +58,7 @@ class Alternative:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def ties(self) -> int:
+    def links(self) -> int:
         """Number of submap pairs with matches or loops; several constraints of one pair count once."""
         submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
         links = [r for r in self.graph.records.values() if r.group in CONSTRAINTS and isinstance(r, BetweenRecord)]
@@ -180,7 +180,7 @@ def rank_alternatives(
     ranking = rank_by_entropy(candidates, model=model, progress=progress)
     clarity = {r.index: r.clarity for r in ranking.order}
     fits = [(chi2_of(a.graph), a.solution.score.dof) for a in alternatives]
-    scale = noise_scale([a.ties for a in alternatives], fits)
+    scale = noise_scale([a.links for a in alternatives], fits)
     judged = [
         ScoredMap(k, a, chi2, dof, dof > 0 and float(special.chdtrc(dof, chi2 / scale)) < CONTRADICTION, clarity[k])
         for k, (a, (chi2, dof)) in enumerate(zip(alternatives, fits))

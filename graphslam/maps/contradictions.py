@@ -26,7 +26,7 @@ POINTS, PAIRS = 1500, 400
 BESIDE = 2
 """All voxels within this distance of a point [voxels] must be free to contradict it, so that small pose errors do not
 count."""
-SURE = 0.9
+FREE_SHARE = 0.9
 """Share of the lowest log-odds below which a voxel counts as free. Some settings treat beams without return (glass, far
 walls) as free; a few such beams are not enough."""
 FEW = 50
@@ -169,5 +169,5 @@ def _compared(cloud: Array, T: Array, piece: Piece, model: BeamModel) -> tuple[i
     beside[:, : piece.dim] = list(product(range(-BESIDE, BESIDE + 1), repeat=piece.dim))
     values = _values(piece, (voxels[:, None] + beside).reshape(-1, 3)).reshape(len(voxels), len(beside))
     top, low = values.max(axis=1), values.min(axis=1)
-    free = (top <= SURE * model.clamp_steps[0]) & (low != UNKNOWN)
+    free = (top <= FREE_SHARE * model.clamp_steps[0]) & (low != UNKNOWN)
     return int(np.sum(top >= model.threshold_step)), int(np.sum(free))

@@ -99,7 +99,7 @@ class RunMap:
     passes: Contradictions = NOTHING
     moving: tuple[int, int] = (0, 0)
 
-    def said(self) -> str:
+    def coarse_note(self) -> str:
         """Message if the map was coarsened; otherwise empty."""
         if self.coarsened == 1:
             return ""

@@ -218,7 +218,7 @@ class _Refiner:
             why = "the start contradicts the scans between" if contradicted else "the odometry alone agrees better"
             self.tell(f"{why}: once more from the odometry")
             other = self.from_odometry()
-            used = used & (not other.taken)
+            used = used & (not other.swapped)
             self.reckoned = self.agreement_along(odometry)
         found = self.result(guides.steps[~used & guides.far(self.poses)], other)
         if not found.input_better or self.fixes is not None:  # fixes constrain the path, and the odometry has none

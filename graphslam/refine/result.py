@@ -56,14 +56,14 @@ class AttemptComparison:
         RMS distance between their paths [m].
     kept, left : float
         Agreement of the scans along the path that was kept, and along the other, with the same noise.
-    taken : bool
+    swapped : bool
         The one from the odometry was kept.
     """
 
     apart: float
     kept: float
     left: float
-    taken: bool
+    swapped: bool
 
 
 @dataclass(frozen=True, slots=True)

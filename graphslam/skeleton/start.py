@@ -62,14 +62,14 @@ class ForwardPass:
 
     Parameters
     ----------
-    tied : int
+    aligned : int
         Number of poses that were aligned with landmarks of an earlier traversal.
     refused : int
         Number of rejected observations of such landmarks.
     """
 
     poses: Poses
-    tied: int
+    aligned: int
     refused: int
 
 

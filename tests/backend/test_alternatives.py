@@ -157,11 +157,11 @@ def test_ties_of_one_pair_of_submaps_count_once(run: tuple) -> None:
     submaps, _, loops, divided = run
     assert len({(d.submap_i, d.submap_j) for d in loops}) < len(loops)
     again = alternative("as the run", solve_choice(submaps, _all(loops), OPTIONS, loops=loops), divided)
-    assert again.ties == len({(d.submap_i, d.submap_j) for d in loops})
+    assert again.links == len({(d.submap_i, d.submap_j) for d in loops})
     folded = solve_choice(submaps, _all(loops), OPTIONS, loops=loops)
     fold(folded, RobustKernel())  # within the first submap, and from it to the second
-    assert alternative("folded", folded, divided).ties == again.ties + 2
-    assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).ties == 0
+    assert alternative("folded", folded, divided).links == again.links + 2
+    assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).links == 0
 
 
 def _all(loops: list[LoopDecision]) -> frozenset[tuple[int, int]]:

@@ -59,19 +59,19 @@ def followed(
         poses.append(odometry.pose)
         if k == 0:
             odometry.errors.begin()
-        if truth is not None and odometry.way - way >= PIECE:
+        if truth is not None and odometry.length - way >= PIECE:
             a, b = poses[begin], poses[k]
             C = relative_covariance((a, b), (a, b), odometry.errors.joint)
             e = se3.se3_log(se3.se3_between(se3.se3_between(a, b), se3.se3_between(truth[begin], truth[k])))
             nees.append(float(e @ np.linalg.solve(C, e)) / 6.0)
             odometry.errors.begin()
-            begin, way = k, odometry.way
+            begin, way = k, odometry.length
     spent += time.process_time()
     path = np.array(poses)
     rate = float(np.median(np.diff(clouds.times)))
     cpu = spent / max(len(path) - 5, 1)
     bad = {s: n for s, n in states.items() if s not in ("first", "matched")}
-    said = f"{len(path):5d} scans {odometry.way:6.1f} m  {1e3 * cpu:6.1f} ms a scan ({rate / cpu:4.1f} × real time)"
+    said = f"{len(path):5d} scans {odometry.length:6.1f} m  {1e3 * cpu:6.1f} ms a scan ({rate / cpu:4.1f} × real time)"
     if nees:
         inside = np.mean(np.array(nees) < 12.6 / 6.0)
         said += f"  NEES/6 {np.mean(nees):5.2f} (median {np.median(nees):4.2f}, {inside:.0%} inside 95 %)"

@@ -150,7 +150,7 @@ def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> Non
     apart = np.linalg.norm(truth[:, None, :3] - truth[None, :, :3], axis=2)
     hits, visits = np.zeros(4), 0
     for j in range(len(places)):
-        rows = np.flatnonzero((places.way[j] - places.way >= 30.0) & (places.submap != places.submap[j]))
+        rows = np.flatnonzero((places.arc[j] - places.arc >= 30.0) & (places.submap != places.submap[j]))
         if not len(rows) or not np.any(apart[j, rows] < 3.0):
             continue
         visits += 1

@@ -47,13 +47,13 @@ def test_statistic_of_noise_that_is_fitted_has_the_distribution_it_is_compared_w
 
 def test_distances_left_out_take_away_what_they_cost(clean) -> None:
     s = clean.copy(free=(), windows=[replace(clean.windows[0])])
-    s.settle(30, 1e-9)
+    s.converge(30, 1e-9)
     gain, before = s.gain_without_distances(2)[0], s.total()
     k = int(np.argmax(gain))
     steps = s.windows[0].steps.copy()
     steps[k + 1 : k + 3, 5] = 1e6
     without = s.copy(windows=[replace(s.windows[0], steps=steps)])
-    without.settle(30, 1e-9)
+    without.converge(30, 1e-9)
     assert before - without.total() == pytest.approx(gain[k], rel=0.02)
 
 

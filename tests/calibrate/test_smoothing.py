@@ -59,7 +59,7 @@ def test_likelihood_and_step_are_those_of_dense_algebra(visits, bearings):
     assert s.objective() == pytest.approx(wanted, abs=1e-3)
     before = states_of(s)
     moved = s.copy()
-    moved.settle(iterations=1)
+    moved.converge(iterations=1)
     np.testing.assert_allclose(states_of(moved) - before, step, atol=2e-5)
 
 
@@ -75,14 +75,14 @@ def test_a_nuisance_that_goes_early_leaves_its_place_to_another():
     assert s.objective() == pytest.approx(wanted, abs=1e-3)
     before = states_of(s)
     moved = s.copy()
-    moved.settle(iterations=1)
+    moved.converge(iterations=1)
     np.testing.assert_allclose(states_of(moved) - before, step, atol=2e-5)
 
 
 def test_settled_states_are_a_minimum_of_the_residuals():
     rng = np.random.default_rng(5)
     s = Smoothing([window(rng) for _ in range(2)], np.zeros(3), ("yaw_bias", "range_offset"), ())
-    value = s.settle()
+    value = s.converge()
     x = states_of(s)
     assert value == pytest.approx(float(np.sum(residuals(s, x)[0] ** 2)), rel=1e-9)
     for _ in range(20):

@@ -15,7 +15,7 @@ from graphslam.core.progress import COMPILING, Bar, compiling, printable, shown_
 def test_characters_that_control_a_terminal_become_escapes(capfd: pytest.CaptureFixture[str]) -> None:
     assert printable("a\x1b[2Jb\nc\x07é") == r"a\x1b[2Jb" "\n" r"c\x07é"
     with Bar(name="log\x1b]0;title\x07", total=2) as bar:
-        bar.say("\x1b[31mred")
+        bar.note("\x1b[31mred")
     written = capfd.readouterr().err
     assert r"log\x1b]0;title\x07" in written
     assert "\x1b[31m" not in written
@@ -47,7 +47,7 @@ def test_work_goes_on_without_stderr(stream: io.StringIO | None, monkeypatch: py
     assert list(Bar(range(5), "counting", mininterval=0.0)) == [0, 1, 2, 3, 4]
     with Bar(total=3) as bar:
         bar.update(2)
-        bar.say("note")
+        bar.note("note")
 
 
 def test_a_bar_says_that_kernels_are_compiled_and_one_is_shown_where_there_is_none(

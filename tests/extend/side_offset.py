@@ -105,8 +105,8 @@ class SideOffsetFactors(PendingMeasurements):
             self.add_factors(s)
         return ids
 
-    def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
-        """See :meth:`PendingMeasurements.tie`."""
+    def attach(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
+        """See :meth:`PendingMeasurements.attach`."""
         arm, C = lever_arm(T_node_body, covariance, np.zeros(2))
         sigma = float(np.sqrt(reading.sigma**2 + C[0, 1, 1]))
         self.graph.insert(SideOffsetRecord(reading.factor_id, node, arm[0], reading.value, sigma))

@@ -96,14 +96,14 @@ def test_what_a_chain_knows_of_two_places_is_what_samples_say(dim: int) -> None:
 def test_places_lie_along_the_way() -> None:
     submaps = square()
     places = loop_places(submaps, 3.0)
-    assert np.all(np.abs(np.diff(places.way) - 3.0) <= 1.01)
+    assert np.all(np.abs(np.diff(places.arc) - 3.0) <= 1.01)
     assert places.of_submap(1).tolist() == np.flatnonzero(places.submap == 1).tolist()
-    assert places.way[places.of_submap(2)[0]] == pytest.approx(40.0)
-    assert places.nearest(0, np.array([7.2, 0.3, 0.0])) == int(np.argmin(np.abs(places.way - 7.2)))
+    assert places.arc[places.of_submap(2)[0]] == pytest.approx(40.0)
+    assert places.nearest(0, np.array([7.2, 0.3, 0.0])) == int(np.argmin(np.abs(places.arc - 7.2)))
     with pytest.raises(GeometryError):
-        Places(places.node, places.submap[:-1], places.T_base_node, places.way, places.time)
+        Places(places.node, places.submap[:-1], places.T_base_node, places.arc, places.time)
     with pytest.raises(DataError):
-        Places(places.node, places.submap, places.T_base_node, places.way[::-1], places.time)
+        Places(places.node, places.submap, places.T_base_node, places.arc[::-1], places.time)
     with pytest.raises(DataError):
         loop_places([Submap(key=0, interval=(0, 1), exit_pose=np.zeros(3), exit_covariance=np.eye(3))])
 
@@ -113,7 +113,7 @@ def plain_pairs(places: Places, chain: ChainRelativePoses, c: CandidateConfig) -
     out = set()
     for i in range(len(places)):
         for j in range(i + 1, len(places)):
-            if places.way[j] - places.way[i] < c.least_way or places.submap[i] == places.submap[j]:
+            if places.arc[j] - places.arc[i] < c.least_way or places.submap[i] == places.submap[j]:
                 continue
             T, P = chain(np.array([i]), np.array([j]))
             R = se3.quat_to_matrix(T[0, 3:])
@@ -146,7 +146,7 @@ def test_proximity_gives_the_pairs_that_may_overlap() -> None:
     for a in thin:
         for b in thin:
             if a is not b and places.submap[a.i] == places.submap[b.i]:
-                assert abs(places.way[a.j] - places.way[b.j]) >= 12.0
+                assert abs(places.arc[a.j] - places.arc[b.j]) >= 12.0
     # what was tried is not tried again, what shares a map never
     assert proximity_candidates(places, chain, tried=[(x.i, x.j) for x in thin]) == []
     every = {(a, b) for a in range(len(submaps)) for b in range(a)}

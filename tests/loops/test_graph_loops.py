@@ -142,7 +142,7 @@ def test_places_of_a_graph_are_those_of_its_submaps() -> None:
     np.testing.assert_allclose(ours.T_base_node, plain.T_base_node, atol=1e-9)
     np.testing.assert_array_equal(ours.submap, plain.submap)
     np.testing.assert_allclose(ours.time, plain.time)
-    np.testing.assert_allclose(ours.way, plain.way, rtol=0.02)
+    np.testing.assert_allclose(ours.arc, plain.arc, rtol=0.02)
 
 
 def test_what_is_no_chain_is_refused() -> None:

@@ -66,7 +66,7 @@ def test_right_ties_are_found_from_nothing(drives: tuple, two: TwoSessions) -> N
     for k, x in enumerate(apart):
         for y in apart[:k]:
             same = two.known.places.submap[x.i] == two.known.places.submap[y.i]
-            assert not same or abs(two.new.places.way[x.j] - two.new.places.way[y.j]) >= 12.0
+            assert not same or abs(two.new.places.arc[x.j] - two.new.places.arc[y.j]) >= 12.0
 
 
 def test_sessions_that_do_not_overlap_are_reported(two: TwoSessions) -> None:

@@ -74,11 +74,11 @@ def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
     for x in found:
         a, b = places.T_base_node[x.i], places.T_base_node[x.j]
         assert np.linalg.norm(a[:dim] - b[:dim]) <= 1.6  # no farther than half the spacing of places
-        assert places.way[x.j] - places.way[x.i] >= 12.0
+        assert places.arc[x.j] - places.arc[x.i] >= 12.0
         np.testing.assert_allclose(x.T_ij, g.between(a, b), atol=1e-12)
         sigma = [0.08, 0.08, 0.011] if dim == 2 else [0.011, 0.011, 0.011, 0.08, 0.08, 0.03]
         np.testing.assert_allclose(x.covariance, np.diag(np.square(sigma)))
-    ways = places.way[[x.j for x in found]]
+    ways = places.arc[[x.j for x in found]]
     assert np.diff(ways).min() >= 6.0
     assert len(found) == 2
     assert not overlap_candidates(submaps, places, config=OverlapConfig(least_way=100.0))

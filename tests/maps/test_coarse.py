@@ -82,7 +82,7 @@ def test_a_long_straight_drive_has_a_map(way: float, coarsened: int, levels: int
     made = make_run_map(submaps, solved)
     fused = made.fused.grid
     assert (made.coarsened, fused.pool.levels) == (coarsened, levels)
-    assert (f"{0.2 * coarsened:g} m" in made.said()) == (coarsened > 1)
+    assert (f"{0.2 * coarsened:g} m" in made.coarse_note()) == (coarsened > 1)
     points = fused.occupied_cloud()
     for k in range(n):
         assert np.sum(np.abs(points[:, 0] - k * way / n) < 4.0) > 50

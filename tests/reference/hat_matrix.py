@@ -28,7 +28,7 @@ def whitened_residual(record: object, values: Values) -> np.ndarray:
         g = sensor_biases_at(values, record.robot)
         return r + record.whitener[:, len(z) :] @ g
     if isinstance(record, SensorBiasRecord):
-        return record.root @ sensor_biases_at(values, record.robot) - record.told
+        return record.root @ sensor_biases_at(values, record.robot) - record.offset
     if isinstance(record, BetweenRecord):
         h = se2_between(values.poses[record.i], values.poses[record.j])
         return record.whitener @ se2_log(se2_between(record.T_ij, h))

@@ -79,7 +79,7 @@ def test_starts_come_nearer(laps: Laps, problem: SkeletonProblem) -> None:
     cost = [Network(lay, p).objective for p in (reckoned, chain, walk.poses)]
     assert cost[0] > cost[1] > cost[2]
     assert rms(reckoned, laps.truth) > rms(chain, laps.truth)
-    assert walk.tied > problem.poses // 3
+    assert walk.aligned > problem.poses // 3
 
 
 def test_chain_start_is_the_optimum_of_all_but_the_landmarks(problem: SkeletonProblem) -> None:

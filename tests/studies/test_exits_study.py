@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from graphslam.sim.crawler_config import CrawlerConfig
-from graphslam_studies.exits import FACTOR, STUDY, drawn_robot, inside_table, told
+from graphslam_studies.exits import FACTOR, STUDY, assumed_noise, drawn_robot, inside_table
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
 
 COLUMNS = ["world", "run", "algorithm", "submap", "quantity", "value"]
@@ -28,7 +28,7 @@ def test_robots_are_drawn_over_a_factor_of_four_around_every_default() -> None:
 
 def test_the_estimator_is_reported_what_a_data_sheet_says() -> None:
     robot, _ = drawn_robot(2)
-    noise = told(robot)
+    noise = assumed_noise(robot)
     assert (noise.wheel, noise.wheel_scale, noise.attitude_bias) == (
         robot.wheel_sigma,
         robot.wheel_scale,

@@ -18,7 +18,7 @@ Flags = npt.NDArray[np.bool_]
 
 NEIGHBOURS = 8
 """Number of points of the same step to fit a surface, the beam's own included."""
-SURE = 0.1
+NORMAL_SIGMA = 0.1
 """Largest σ of a known normal [rad]; σ of a plane through n points with variance λ₀ across and λ₁ along its shorter
 axis is ``sqrt(λ₀ / (n λ₁))``. For points on a line or in random positions it is 0.3."""
 STEEP = float(np.sqrt(0.5))
@@ -51,7 +51,7 @@ def upright_beams(steps: Steps) -> Flags:
     normals, spread = np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
     fit_surfaces(points, near, NEIGHBOURS, normals, spread, np.empty((len(rows), 2, 3)))
     with np.errstate(invalid="ignore", divide="ignore"):
-        known = spread[:, 0] <= NEIGHBOURS * SURE**2 * spread[:, 1]
+        known = spread[:, 0] <= NEIGHBOURS * NORMAL_SIGMA**2 * spread[:, 1]
     up = up_directions(steps.tilt)[step]
     out[rows] = ~known | (np.abs(np.einsum("ki,ki->k", normals, up)) < STEEP)
     return out

@@ -180,7 +180,7 @@ class LogPreparation:
         self.done = False
         """Is the log at its end, and prepared completely?"""
         self._streams: tuple[str, str] | None = None
-        self._taken, self._rows = 0, 0  # scans and observations of the stream
+        self._scans, self._rows = 0, 0  # scans and observations of the stream
 
     @property
     def prepared(self) -> PreparedLog:
@@ -211,9 +211,9 @@ class LogPreparation:
             return False
         ended = self.feed.ended
         motion_name, stream = self._streams or self._missing()
-        if not ended and self.feed.count(stream) == self._taken:
+        if not ended and self.feed.count(stream) == self._scans:
             return False
-        part: Any = self.feed.part(stream, self._taken)
+        part: Any = self.feed.part(stream, self._scans)
         motion: Any = self.feed.part(motion_name)
         if len(motion.times) == 0:
             raise MissingDataError("motion stream is empty", where=self.feed.name)
@@ -222,9 +222,9 @@ class LogPreparation:
             if n == 0:
                 return False
             part = part if n == len(part.times) else part.take(slice(0, n))
-        self._taken += len(part.times)
+        self._scans += len(part.times)
         self._take(part, motion_name, motion, stream, ended)
-        self.feed.discard_before(stream, self._taken)
+        self.feed.discard_before(stream, self._scans)
         self.done = ended
         return True
 

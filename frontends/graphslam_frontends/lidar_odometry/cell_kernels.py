@@ -46,7 +46,7 @@ class Cells(NamedTuple):
     """Mean of the points ``(b, 3)``."""
     scatter: F8
     """Sums of squares about the mean ``(b, 6)``: xx, xy, xz, yy, yz, zz."""
-    told: I4
+    updated: I4
     """Number of points when the cell was last updated for matching; 0: not valid yet."""
     centre: F8
     """Mean used for matching ``(b, 3)``."""
@@ -105,7 +105,7 @@ def _put(c: Cells, key: Any) -> Any:
         return np.int64(-1)
     c.used[0] = b + 1
     c.keys[h], c.slots[h], c.cube[b] = key, b, key
-    c.number[b], c.told[b], c.n_around[b], c.seen[b] = 0, 0, -1, -1
+    c.number[b], c.updated[b], c.n_around[b], c.seen[b] = 0, 0, -1, -1
     c.mean[b, :], c.made[b] = 0.0, 0.0
     c.scatter[b, :] = 0.0
     c.near[b, :] = UNKNOWN
@@ -248,8 +248,8 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
     moved = 0.0
     for i in range(3):
         moved = max(moved, abs(c.mean[b, i] - c.centre[b, i]))
-    new = c.told[b] == 0
-    c.told[b] = n
+    new = c.updated[b] == 0
+    c.updated[b] = n
     c.centre[b, :] = c.mean[b]
     if new or moved > 0.25 * size / FINE:
         _enter(c, b, size, new)
@@ -299,7 +299,7 @@ def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], 
     for k in range(m):
         b = touched[k]
         n = c.number[b]
-        if n >= LEAST and n >= c.told[b] + max(1, c.told[b] // 4):
+        if n >= LEAST and n >= c.updated[b] + max(1, c.updated[b] // 4):
             _tell(c, b, how, around)
     return lost
 
@@ -311,7 +311,7 @@ def keep_since(c: Cells, out: Cells, scan: int) -> None:
         if c.seen[b] < scan or c.number[b] == 0:
             continue
         k = _put(out, c.cube[b])
-        out.number[k], out.told[k], out.seen[k], out.made[k] = c.number[b], c.told[b], c.seen[b], c.made[b]
+        out.number[k], out.updated[k], out.seen[k], out.made[k] = c.number[b], c.updated[b], c.seen[b], c.made[b]
         out.mean[k], out.scatter[k], out.centre[k], out.root[k] = (
             c.mean[b],
             c.scatter[b],
@@ -329,7 +329,7 @@ def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
             for dj in range(-1, 2):
                 for dk in range(-1, 2):
                     at = _find(c, key + (np.int64(di) << 42) + (np.int64(dj) << 21) + dk)
-                    if at >= 0 and c.told[at] > 0:
+                    if at >= 0 and c.updated[at] > 0:
                         c.around[b, n] = at
                         n += 1
         c.n_around[b] = n

@@ -74,13 +74,13 @@ class CellMap:
         self.cells = _empty(_FIRST_ROOM, 1 if config.planes else 3)
 
     def __len__(self) -> int:
-        return int(np.count_nonzero(self.cells.told[: self.cells.used[0]]))
+        return int(np.count_nonzero(self.cells.updated[: self.cells.used[0]]))
 
     @property
     def centres(self) -> Array:
         """Centres of the cells that are in use ``(n, 3)``, world [m]."""
         used = int(self.cells.used[0])
-        return np.asarray(self.cells.centre[:used][self.cells.told[:used] > 0])
+        return np.asarray(self.cells.centre[:used][self.cells.updated[:used] > 0])
 
     def add(self, points: Array, scan: int, wide: CellMap | None = None) -> None:
         """Add points ``(n, 3)``, world frame, to their cells; ``scan`` is an increasing number.
@@ -189,7 +189,7 @@ def _empty(blocks: int, rows: int) -> kernels.Cells:
         number=np.zeros(blocks, np.int32),
         mean=np.zeros((blocks, 3)),
         scatter=np.zeros((blocks, 6)),
-        told=np.zeros(blocks, np.int32),
+        updated=np.zeros(blocks, np.int32),
         centre=np.zeros((blocks, 3)),
         root=np.zeros((blocks, rows, 3)),
         seen=np.full(blocks, -1, np.int64),

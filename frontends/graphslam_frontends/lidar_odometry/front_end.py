@@ -202,7 +202,7 @@ class LidarFrontEnd(FrontEnd):
                 odometry.errors.begin()
             kept.append(seen[-1])
             n = len(kept) - 1
-            full = odometry.way - begin >= config.length and n >= config.scans
+            full = odometry.length - begin >= config.length and n >= config.scans
             if k == scans - 1 or full or n >= MOST_SCANS:
                 bent = [] if warned else [*_bent(key, kept), *_uneven(key, kept)]
                 warned = warned or bool(bent)
@@ -216,7 +216,7 @@ class LidarFrontEnd(FrontEnd):
                 odometry.errors.begin()
                 for i in range(k - n, k):  # the points of a submap are needed again only by a refinement
                     seen[i] = replace(seen[i], points=seen[i].points.astype(np.float32))
-                kept, key, begin = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
+                kept, key, begin = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.length
         if scans and not mapped:
             c = self.config.odometry
             raise DataError(

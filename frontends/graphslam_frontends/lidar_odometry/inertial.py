@@ -95,7 +95,7 @@ class ImuReadings:
         self.times = np.concatenate([self.times[a:], t])
         self.rate, self.force = np.concatenate([self.rate[a:], w]), np.concatenate([self.force[a:], f])
 
-    def way(self, anchor: float, at: Array, bias: Array) -> InertialMotion | None:
+    def motion(self, anchor: float, at: Array, bias: Array) -> InertialMotion | None:
         """Preintegrated motion at times ``(m,)``, relative to the body at ``anchor``; None: readings are missing."""
         first, last = min(anchor, float(at.min())), max(anchor, float(at.max()))
         t = self.times
@@ -235,7 +235,7 @@ class InertialPredictor:
         if not (self.believed and self.known) or not 0.0 < time - self.kept[-1][0] <= LONGEST:
             return None
         last, pose = self.kept[-1]
-        step = self.readings.way(last, np.array([time]), self.bias)
+        step = self.readings.motion(last, np.array([time]), self.bias)
         return None if step is None else np.asarray(se3.se3_compose(pose, step.poses(self.velocity, self.gravity)[0]))
 
     def reach(self, time: float) -> float:
@@ -258,7 +258,7 @@ class InertialPredictor:
         # readings are interpolated linearly, and so are the motions between them
         knots = time - np.array([ages.max(), ages.min()])
         at = np.concatenate([knots[:1], t[(t > knots[0]) & (t < knots[1])], knots[1:]])
-        motion = self.readings.way(last, np.append(at, time), self.bias)
+        motion = self.readings.motion(last, np.append(at, time), self.bias)
         if motion is None:
             return None
         T = motion.poses(self.velocity, self.gravity)
@@ -280,7 +280,7 @@ class InertialPredictor:
         """Update with a scan matched at ``pose``; constant velocity predicted ``even`` (both ``T_first_body``)."""
         if self.kept and time > self.kept[-1][0]:
             before, last = self.kept[-1]
-            motion = self.readings.way(before, np.array([time]), self.bias)
+            motion = self.readings.motion(before, np.array([time]), self.bias)
             if motion is None:
                 self.forget()
             else:
@@ -329,7 +329,7 @@ class InertialPredictor:
         """Velocity and gravity in the body frame at scan k of the window (default: the last), from all positions."""
         anchor, pose = self.kept[k]
         at = np.array([t for t, _ in self.kept])
-        motion = self.readings.way(anchor, at, self.bias)
+        motion = self.readings.motion(anchor, at, self.bias)
         if motion is None or len(at) < (2 if self.known else 3):
             self.known = False
             return
@@ -412,7 +412,7 @@ def gravity_along_path(inertial: InertialPredictor, times: Array, poses: Array) 
         if b - a < 3 or (at and t <= at[-1]):
             continue
         some = np.arange(a, b)
-        motion = readings.way(t, times[some], inertial.bias)
+        motion = readings.motion(t, times[some], inertial.bias)
         if motion is None:
             continue
         span = motion.seconds[-1] - motion.seconds[0]

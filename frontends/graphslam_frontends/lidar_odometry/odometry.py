@@ -232,7 +232,7 @@ class LidarOdometry:
         self.time = -np.inf
         self.recent: deque[tuple[float, Array]] = deque(maxlen=50)
         self.scan = -1
-        self.way, self.ways = 0.0, [0.0]
+        self.length, self.lengths = 0.0, [0.0]
         self.overlaps: deque[float] = deque(maxlen=REMEMBERED)
         self.coarse: deque[float] = deque(maxlen=REMEMBERED)
         self.qualities: deque[float] = deque(maxlen=REMEMBERED)
@@ -335,10 +335,10 @@ class LidarOdometry:
             self.twist, self.dt = (0.5 if self.lost else 1.0) * np.asarray(se3.se3_log(made)), dt
         self.time = time
         self.recent.append((time, self.pose))
-        self.way += float(np.linalg.norm(made[:3]))
-        self.ways.append(self.way)
+        self.length += float(np.linalg.norm(made[:3]))
+        self.lengths.append(self.length)
         if self.scan % 20 == 19:
-            old = int(np.searchsorted(self.ways, self.way - c.window)) - 1
+            old = int(np.searchsorted(self.lengths, self.length - c.window)) - 1
             since = min(old, self.scan - WINDOW_SCANS)
             if since > 0:
                 for level in self.levels:

@@ -40,7 +40,7 @@ MATCHING = RegistrationConfig(
         fitness=0.55, fitness_alone=0.7, fitness_upright=0.45, degeneracy=1e-3, degeneracy_planar=1e-3, tilt=np.pi
     ),
 )  # fmt: skip
-SURE = 4.0
+MARGIN = 4.0
 """Standard errors subtracted from an error before it is compared with its tolerance."""
 SCALE, ANGLE, LEVER, LAG = 0.1, float(np.deg2rad(4.0)), 0.2, 0.2
 """Tolerances: scale, angle [rad], lever arm [m], time [s]."""
@@ -146,7 +146,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
         fits["turn"] = _regress([turn, seconds_of], m[:, heading], var[:, heading], STEP / 3.0)[0]
         if group.dim == 3:
             across = [_regress([turn], m[:, k] - o[:, k], var[:, k], STEP / 3.0)[0] for k in (0, 1)]
-            worst = max(across, key=lambda f: abs(f.value) - SURE * f.sigma)
+            worst = max(across, key=lambda f: abs(f.value) - MARGIN * f.sigma)
             fits["tilt"] = worst
         if seconds > 0 and (sigma := _mirrored(steps, pairs)) is not None:
             fits["turn"] = FittedCoefficient(-1.0, sigma)
@@ -284,7 +284,7 @@ def _mirrored(steps: Steps, pairs: list[tuple[tuple[int, int], tuple[int, int]]]
     if len(better) < 4:
         return None
     mean, sigma = float(np.mean(better)), float(np.std(better, ddof=1)) / np.sqrt(len(better))
-    return max(float(sigma), 0.01) if mean > max(SURE * sigma, 0.05) else None
+    return max(float(sigma), 0.01) if mean > max(MARGIN * sigma, 0.05) else None
 
 
 def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> list[FittedCoefficient]:
@@ -392,7 +392,7 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
 
 
 def _level(error: float, sigma: float, tolerance: float) -> Level:
-    least = abs(error) - SURE * sigma
+    least = abs(error) - MARGIN * sigma
     return "bad" if least > BAD * tolerance else "look" if least > tolerance else ""
 
 

@@ -43,7 +43,7 @@ FREE_TILT = 0.02
 """σ of roll and pitch of the motion of a step if gravity is measured [rad]: gravity already determined them."""
 LAY = {2: 1.0, 3: 4.0}
 """Default batch duration for surfaces in 2-D and 3-D [s]."""
-TOLD = 1e-5
+TILT_NOISE = 1e-5
 """White noise of roll and pitch by gravity, besides time-correlated and constant errors [rad]."""
 NORMAL_SIGMA = 0.03
 """σ of the normal of a surface [rad]; it sets the level of spurious information."""
@@ -192,7 +192,7 @@ class ScanToWindowOdometry:
         H[:, :6] = D[0]
         H[:, -4:-2] = H[:, -2:] = np.eye(2)
         r = self.steps.tilt[self.k] - seen[0] - self.biases[-4:-2] - self.biases[-2:]
-        gain = self._gain(H, np.zeros((2, 0)), np.zeros(0, np.int64), TOLD**2)
+        gain = self._gain(H, np.zeros((2, 0)), np.zeros(0, np.int64), TILT_NOISE**2)
         self._correct(gain, r)
 
     # --- corrections -------------------------------------------------------------------------------------------------

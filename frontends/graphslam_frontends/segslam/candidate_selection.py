@@ -76,7 +76,7 @@ class _Places:
         Index of the segment of each position, 0 … c - 1.
     first : (c,) int64
         Index of the first position of each segment.
-    way : (m,)
+    length : (m,)
         Path length from the root's anchor, through the sample [m].
     sigma : (m,)
         Of the path-length model [m].
@@ -87,7 +87,7 @@ class _Places:
     positions: Array
     owner: Ints
     first: Ints
-    way: Array
+    length: Array
     sigma: Array
 
 
@@ -156,7 +156,7 @@ def select_candidates(
     measure = flat / places.sigma
     far = measure > config.sigmas
     if g.dim == 3:
-        height = config.height + config.rise(places.way)
+        height = config.height + config.rise(places.length)
         far |= np.abs(places.positions[:, 2] - at[..., 2]) > height
     measure[far] = np.inf
     ends = [*places.first[1:].tolist(), len(places.owner)]
@@ -195,7 +195,7 @@ def _known(
         T = g.compose(T_map, T_seg_body[k])
         half = np.full(g.dim, 0.5 * config.near)
         half[:2] += config.sigmas * places.sigma[nearest[k]]
-        half[2:] += config.height + config.rise(places.way[nearest[k]])
+        half[2:] += config.height + config.rise(places.length[nearest[k]])
         count = int(box_query(grid, (T[: g.dim] - half)[None], (T[: g.dim] + half)[None]).known[0])
         if count < config.known:
             tally.unknown += 1
@@ -210,7 +210,7 @@ def _known(
         segments=places.index[chosen],
         T_map_body=np.stack(poses),
         distance=flat[at],
-        travelled=places.way[at],
+        travelled=places.length[at],
         sigma=places.sigma[at],
         known=np.array(known, np.int64),
     )

@@ -198,7 +198,7 @@ def grow_sample_by(
         Segments ``(k,)`` that fit → index of the chosen one, 0 … k - 1.
     """
     growing = _GrowingSample(segmap, root, choose, local_length, local_depth)
-    level = growing.settle(0)
+    level = growing.add_joined(0)
     while level:
         links = growing.links(level)
         chosen = [links[j] for j in order(len(links))] if links else []
@@ -336,7 +336,7 @@ class _GrowingSample:
         far = self.local_length and self.travelled[k] > self.local_length
         return not (far or (self.local_depth and self.depth[k] >= self.local_depth))
 
-    def settle(self, k: int) -> list[int]:
+    def add_joined(self, k: int) -> list[int]:
         """Add all segments that share a frame with segment k, recursively; returns their indices, k first."""
         found, g, t, segmap = [k], self.segmap.group, self.t, self.segmap
         for k in found:  # the list grows in the loop
@@ -384,7 +384,7 @@ class _GrowingSample:
         chosen = self.draw(there)
         place = self.add(chosen, k, at, at)
         self.frames.joined(k, self.segments[k], chosen, direction)
-        return self.settle(place)
+        return self.add_joined(place)
 
     def sample(self) -> MapSample:
         """The finished sample."""

@@ -78,7 +78,7 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
     if folder.kind == "interrupted":
         return [missing_note("loop closures on the path, and NEES by submap: the run is not finished.")]
     if folder.kind == "merged":
-        return _session_ties(folder)
+        return _session_links(folder)
     try:
         m = read_map(folder.path)
     except GraphSlamError as error:
@@ -91,7 +91,7 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
     return [*loops, *_nees(folder, m.node_poses, m.node_covariances, bases)]
 
 
-def _session_ties(folder: ReportFolder) -> list[Markup]:
+def _session_links(folder: ReportFolder) -> list[Markup]:
     """Loop closures between sessions over the paths of both."""
     from graphslam.plots.loops import plot_loops
     from graphslam.plots.save import figure_png

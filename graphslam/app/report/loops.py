@@ -26,10 +26,10 @@ def loops_section(folder: ReportFolder) -> Markup:
     if folder.loops is None:
         why = folder.problems.get("events.jsonl", "does not say")
         return page_section(
-            "loops", title, missing_note("the ledger of loops; events.jsonl ", why, "."), *_ties(folder)
+            "loops", title, missing_note("the ledger of loops; events.jsonl ", why, "."), *_session_table(folder)
         )
     if not folder.loop_rows:
-        return page_section("loops", title, _none(folder), *_ties(folder))
+        return page_section("loops", title, _none(folder), *_session_table(folder))
     counts = folder.loops.counts()
     summary = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
     rows = sorted(folder.loop_rows, key=_rank)
@@ -51,7 +51,7 @@ def loops_section(folder: ReportFolder) -> Markup:
             "documentation of loop closures."
         )
     )
-    return page_section("loops", title, *parts, *_ties(folder))
+    return page_section("loops", title, *parts, *_session_table(folder))
 
 
 def _none(folder: ReportFolder) -> Markup:
@@ -92,7 +92,7 @@ def _history(folder: ReportFolder) -> list[Markup]:
     return [folded_section(f"{of} loop closures with several decisions, in order", html_table(rows, columns))]
 
 
-def _ties(folder: ReportFolder) -> list[Markup]:
+def _session_table(folder: ReportFolder) -> list[Markup]:
     """Candidates of loop closures between sessions, accepted or rejected."""
     if folder.kind != "merged":
         return []

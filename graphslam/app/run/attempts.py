@@ -28,9 +28,9 @@ def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequenc
     with another seed and the better map is kept. This is not done for a folder that already settled on a draw, or if
     loops were removed by hand.
     """
-    found = _MapCandidates([] if slam.settled is None else slam.settled.attempts)
+    found = _MapCandidates([] if slam.seed_choice is None else slam.seed_choice.attempts)
     front, folder, most = slam.options.front, slam.folder, slam.options.settings.backend.draws
-    again = front is not None and front.draws and slam.settled is None and not undo
+    again = front is not None and front.draws and slam.seed_choice is None and not undo
     while True:
         for candidate in _solved(inputs, slam, clock, undo):
             found.add(candidate)
@@ -38,8 +38,8 @@ def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequenc
             break
         logger.warning("overlapping submaps still contradict each other: making submaps again with another seed")
         slam = slam.next_draw()
-    if front is not None and folder is not None and slam.settled is None and slam.draw:
-        folder.settle(found.kept.draw, found.of_others(found.kept.draw))
+    if front is not None and folder is not None and slam.seed_choice is None and slam.draw:
+        folder.keep_draw(found.kept.draw, found.of_others(found.kept.draw))
     return found.result()
 
 

@@ -14,7 +14,7 @@ from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load
 from graphslam.calibrate.calibrate import CALIBRATIONS
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections, moved_end
-from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
+from graphslam.calibrate.estimate import NAMES, SIGNIFICANT, Calibration, estimate_text
 from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_observations
 from graphslam.calibrate.windows import ObservationLog
 from graphslam.core.config import merge_options
@@ -210,8 +210,8 @@ def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
 
 def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Findings on the constant errors that were estimated with the map."""
-    significant = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
-    wild = [r for r in significant if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
+    significant = [r for r in facts if abs(r["value"]) > SIGNIFICANT * r["sigma"]]
+    wild = [r for r in significant if abs(r["value"]) - SIGNIFICANT * r["sigma"] > SIGNIFICANT * r["beforehand"]]
     if not facts:
         return []
     estimates = [estimate_text(r["name"], r["value"], r["sigma"]) for r in significant]

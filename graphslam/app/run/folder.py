@@ -80,7 +80,7 @@ class RunFolder:
                 folder._check_same(old, config)
             else:
                 folder.describe(config)
-            folder._undo_settling()
+            folder._undo_draw()
             remove_stale_files(folder.path)
             yield folder
 
@@ -144,7 +144,7 @@ class RunFolder:
         """
         return SubmapStore(self.path / (SUBMAPS if draw is None else f"{SUBMAPS}-{draw}"), load_grid=load_grid)
 
-    def settled(self) -> SeedChoice | None:
+    def seed_choice(self) -> SeedChoice | None:
         """Draw of the submaps, if several were made and one was chosen."""
         file = resolve_inside(self.path, DRAWS, str(self.path))
         if not file.exists():
@@ -152,10 +152,10 @@ class RunFolder:
         stored = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})
         return SeedChoice(stored["draw"], stored["attempts"])
 
-    def settle(self, draw: int, attempts: list[dict[str, Any]]) -> None:
+    def keep_draw(self, draw: int, attempts: list[dict[str, Any]]) -> None:
         """Keep the submaps of one draw as those of the run, and delete the others.
 
-        If the process is killed before ``draws.json`` is written, :meth:`_undo_settling` restores the earlier state.
+        If the process is killed before ``draws.json`` is written, :meth:`_undo_draw` restores the earlier state.
         """
         if draw:
             (self.path / SUBMAPS).rename(self.path / _BEATEN)
@@ -168,7 +168,7 @@ class RunFolder:
             if old.is_dir() and not old.is_symlink() and _ANOTHER.fullmatch(old.name):
                 shutil.rmtree(old, ignore_errors=True)
 
-    def _undo_settling(self) -> None:
+    def _undo_draw(self) -> None:
         """After a kill: restore the first draw if ``draws.json`` was not written, otherwise delete the other draws."""
         if (self.path / DRAWS).is_file():
             self._drop_beaten()

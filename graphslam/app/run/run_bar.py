@@ -64,7 +64,7 @@ class RunBar(Observer):
         self._stage = name
         self._bar.set_description_str(f"{list(STAGES).index(name) + 1}/{len(STAGES)} {name}", refresh=False)
         self._move(0.0)
-        self._bar.say("")
+        self._bar.note("")
 
     def log_read(self, log: SensorLog) -> None:
         """Set the time interval of the log, for the progress of the front end."""

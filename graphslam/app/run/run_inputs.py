@@ -33,7 +33,7 @@ from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.io.log_store import INDEX_NAME, load_log, save_log
 from graphslam.refine.scans import Scans
 
-TAKEN_FORMAT = "graphslam.taken/1"
+INPUTS_FORMAT = "graphslam.taken/1"
 INPUTS = "inputs"
 SCANS = "scans.npz"
 KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls)
@@ -104,7 +104,7 @@ def write_inputs(folder: Path, inputs: RunInputs, generation: str) -> None:
     """Write the inputs into the folder of a run's files."""
     log = inputs.log
     save_log(replace(log, streams={n: s for n, s in log.streams.items() if _is_kept(s)}), folder / INPUTS)
-    arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
+    arrays: dict[str, Any] = {"format": INPUTS_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
     for k, stream in enumerate(log.streams.values()):
         if not _is_kept(stream):
             arrays[f"times_{k}"] = stream.times
@@ -125,7 +125,7 @@ def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
             where=str(folder),
             wanted="a run of this version; run it again with --resume, finished submaps are reused",
         )
-    log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=TAKEN_FORMAT)
+    log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=INPUTS_FORMAT)
     try:
         streams: dict[str, Any] = {
             str(n): TimestampsOnly(a[f"times_{k}"]) if f"times_{k}" in a else log.streams[str(n)]

@@ -381,8 +381,8 @@ def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> di
         report["two_maps"] = back.two_maps.facts()
     if made.why_no_map:
         report["map_left_out"] = made.why_no_map
-    if fused is not None and fused.said():
-        report["map_coarser"] = fused.said()
+    if fused is not None and fused.coarse_note():
+        report["map_coarser"] = fused.coarse_note()
     if fused is not None and len(fused.passes.pairs):
         report["map_passes"] = fused.passes.facts()
     return report

@@ -75,9 +75,9 @@ class SubmapSlam:
         self.options, self.feed, self.folder = options, feed, folder
         self.control, self.check = options.table("control"), options.table("check")
         feed.places = measured_places(self.control, self.check)
-        self.settled = None if folder is None else folder.settled()
+        self.seed_choice = None if folder is None else folder.seed_choice()
         """Decision between earlier draws of the folder, if there was one."""
-        self._begin(0 if self.settled is None else self.settled.draw, observers)
+        self._begin(0 if self.seed_choice is None else self.seed_choice.draw, observers)
 
     def _begin(self, draw: int, observers: Sequence[Observer]) -> None:
         """Start with a random draw: submaps of it that are in the folder are added; the others follow."""
@@ -87,7 +87,7 @@ class SubmapSlam:
         self.store = None
         if self.folder is not None:
             load = load_spilled if self.options.with_grids else None
-            chosen = 0 if self.settled is None else self.settled.draw
+            chosen = 0 if self.seed_choice is None else self.seed_choice.draw
             self.store = self.folder.submaps_with(load, draw=None if draw == chosen else draw)
         self.submaps: list[Submap] = [] if self.store is None else self.store.complete_prefix()
         if self.store is not None and self.options.front is not None:

@@ -286,7 +286,7 @@ class _Turns:
         Approximate height of the scanner above the ground [m].
     look : bool
         Estimate the height from the scans.
-    gone : list of k MovedObjects or None
+    moving : list of k MovedObjects or None
         Moving objects at the time of each scan, in the level frame.
     """
 
@@ -299,7 +299,7 @@ class _Turns:
         look: bool,
         moving: Sequence[MovedObjects | None],
     ) -> None:
-        self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, moving
+        self.scans, self.level, self.height, self.look, self.moving = scans, level, height, look, moving
         self.coming = deque(at.tolist())
         self.read: dict[int, tuple[Array, Array]] = {}
         self.below: dict[int, float] = {}
@@ -320,7 +320,7 @@ class _Turns:
 
     def _decode(self, k: int) -> None:
         points, origin = _posed(self.scans, k, self.level)
-        objects = self.gone[self.place[k]]
+        objects = self.moving[self.place[k]]
         if objects is not None:
             moved = objects.parts(points)
             points, self.left_out = points[~moved], self.left_out + int(np.count_nonzero(moved))

@@ -38,7 +38,7 @@ class LocalisationResult:
     ----------
     why : str
         Reason why no pose was found; empty if one was found.
-    ties : InterSessionLoops
+    candidates : InterSessionLoops
         All tested candidates with their results.
     used : list of Loop
         Loop closures that determine the pose.
@@ -50,7 +50,7 @@ class LocalisationResult:
     """
 
     why: str
-    ties: InterSessionLoops
+    candidates: InterSessionLoops
     used: list[Loop]
     T_map_base: Array | None = None
     covariance: Array | None = None
@@ -64,7 +64,7 @@ class LocalisationResult:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per candidate, with the reason for its acceptance or rejection."""
-        return self.ties.rows()
+        return self.candidates.rows()
 
     def __repr__(self) -> str:
         if self.T_map_base is None or self.covariance is None:

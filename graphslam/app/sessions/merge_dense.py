@@ -132,7 +132,7 @@ def merge_dense(runs: Sequence[Run], names: Sequence[str], *, by: By = "auto", s
         for k in list(waiting):
             for at in list(first):
                 try:
-                    how[k] = _tie(graph, solve, sessions[at], first[at], sessions[k], by)
+                    how[k] = _attach(graph, solve, sessions[at], first[at], sessions[k], by)
                 except DataError as error:
                     errors.setdefault(k, []).append(error.what)
                     continue
@@ -155,7 +155,7 @@ def merge_dense(runs: Sequence[Run], names: Sequence[str], *, by: By = "auto", s
     return MergedSubmaps(placed, solution, graph, metrics, report)
 
 
-def _tie(
+def _attach(
     graph: FactorGraph, solver: Any, known: DenseSession, known_node: int, new: DenseSession, by: By
 ) -> ConnectedSession:
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
@@ -251,5 +251,5 @@ def _session_row(s: PlacedSession) -> dict[str, Any]:
         "gps": s.session.fixes is not None,
         "ties": None if a is None else len(a.used),
         "ties_dropped": None if a is None else a.dropped,
-        "candidates": [] if a is None or a.ties is None else a.ties.rows(),
+        "candidates": [] if a is None or a.candidates is None else a.candidates.rows(),
     }

@@ -40,7 +40,7 @@ class SensorBiasRecord:
     ----------
     robot : int
         Row of its variables.
-    root, told : (6, 6), (6,)
+    root, offset : (6, 6), (6,)
         ``R`` and ``d``; rows of zeros have no information.
     what : str
         Its source, for messages.
@@ -49,7 +49,7 @@ class SensorBiasRecord:
     factor_id: int
     robot: int
     root: Array
-    told: Array
+    offset: Array
     what: str = "beforehand"
     group: str = "biases"
 
@@ -77,7 +77,7 @@ class SensorBiasBatch(UniformBatch):
     def __init__(self, records: Sequence[SensorBiasRecord], layout: object) -> None:
         super().__init__(records, layout)  # type: ignore[arg-type]
         self._root = np.array([r.root for r in records]).reshape(-1, SIZE, SIZE)
-        self._told = np.array([r.told for r in records]).reshape(-1, SIZE)
+        self._offset = np.array([r.offset for r in records]).reshape(-1, SIZE)
 
     @cached_property
     def rows(self) -> Index:
@@ -97,4 +97,4 @@ class SensorBiasBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         g = np.concatenate(blocks, axis=1)
-        return np.einsum("kij,kj->ki", self._root, g) - self._told, self._root
+        return np.einsum("kij,kj->ki", self._root, g) - self._offset, self._root

@@ -42,8 +42,8 @@ class BarometerFactors(PendingMeasurements):
             self.add_factors(s)
         return ids
 
-    def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
-        """See :meth:`PendingMeasurements.tie`."""
+    def attach(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
+        """See :meth:`PendingMeasurements.attach`."""
         g, r = self.graph, reading
         arm, C = lever_arm(T_node_body, covariance, np.zeros(3))
         if r.source not in self.rows:

@@ -118,8 +118,8 @@ class BeaconFactors(PendingMeasurements):
         for b in self.beacons.values():
             b.row = None if b.row is None else rows.get(b.row)
 
-    def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
-        """See :meth:`PendingMeasurements.tie`."""
+    def attach(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
+        """See :meth:`PendingMeasurements.attach`."""
         r = reading
         cfg, lever = self.ranging[r.source]
         arm, C = lever_arm(T_node_body, covariance, lever)

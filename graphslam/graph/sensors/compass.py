@@ -103,8 +103,8 @@ class CompassFactors(PendingMeasurements):
         """See :meth:`PendingMeasurements.moved`."""
         self.rows[word] = {k: rows[v] for k, v in self.rows[word].items() if v in rows}
 
-    def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
-        """See :meth:`PendingMeasurements.tie`."""
+    def attach(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
+        """See :meth:`PendingMeasurements.attach`."""
         r, T, P = reading, T_node_body, covariance
         g, cfg = self.graph, self.compasses[r.source]
         plane = g.dim == 2

@@ -113,7 +113,7 @@ class ControlFactors(SensorFactors):
                 self._insert(fid, row, ends)
                 self.used.append(row)
         for s in list(self.graph.submaps):
-            self.gps.tie_points(s)
+            self.gps.attach_points(s)
 
     def _refuse(self, fid: int, row: ControlRow, why: DataError) -> None:
         self.graph.ledger.release(fid)

@@ -241,7 +241,7 @@ class GpsFactors(SensorFactors):
         super().__init__(graph)
         self.config = GpsConfig()
         self.waiting: list[PendingFix] = []  # for their submap, sorted by time
-        self.tied: list[AttachedFix] = []  # for a datum
+        self.attached: list[AttachedFix] = []  # for a datum
         self.last_time = -np.inf
         self.bias_begin = -np.inf  # of the last bias
         self.fitted: FixErrors | None = None
@@ -278,7 +278,7 @@ class GpsFactors(SensorFactors):
 
     def waiting_readings(self) -> int:
         """Number of fixes that wait for a submap or for a datum."""
-        return len(self.waiting) + len(self.tied)
+        return len(self.waiting) + len(self.attached)
 
     def finish(self) -> None:
         """Attach a fix at the end of the last submap, and drop later ones."""
@@ -294,17 +294,17 @@ class GpsFactors(SensorFactors):
         late = [f for f in self.waiting if f.time < s.interval[0] and not more and s is g.submaps[-1]]
         self.waiting = [f for f in self.waiting if f not in late]
         self._drop([*dropped, *((f.factor_id, "no submap covers it") for f in late)])
-        if more or not self.tied:
+        if more or not self.attached:
             return
         if g.gps_origin is None:
-            g.gps_origin = self.tied[0].fix.position.copy()
+            g.gps_origin = self.attached[0].fix.position.copy()
         if not g.structure.count("datum"):
-            start = self._datum_if_ready(g.values.poses, g.gps_origin, self.tied[0].fix.config.baseline)
+            start = self._datum_if_ready(g.values.poses, g.gps_origin, self.attached[0].fix.config.baseline)
             if start is None:
                 return
             g.values.datum = start
-            g.log_event("datum", fixes=len(self.tied), T_gps_world=start.tolist())
-        for t in sorted(self.tied, key=lambda t: t.fix.time):
+            g.log_event("datum", fixes=len(self.attached), T_gps_world=start.tolist())
+        for t in sorted(self.attached, key=lambda t: t.fix.time):
             bias = self._bias_of(t.fix)
             W = whitener(self._in_its_frame(t), what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
             z = t.fix.position - g.gps_origin
@@ -316,7 +316,7 @@ class GpsFactors(SensorFactors):
                     point=t.point, stated=t.fix.alone,
                 )
             )  # fmt: skip
-        self.tied = []
+        self.attached = []
 
     def _in_its_frame(self, t: AttachedFix) -> Array:
         """Covariance of a fix with its arm, in the node's frame; of an anisotropic fix in the GPS frame."""
@@ -336,8 +336,8 @@ class GpsFactors(SensorFactors):
         inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
         for fid in inside:
             del self.graph.records[fid]
-        placed = [t.fix.factor_id for t in self.tied if t.node in own]
-        self.tied = [t for t in self.tied if t.node not in own]
+        placed = [t.fix.factor_id for t in self.attached if t.node in own]
+        self.attached = [t for t in self.attached if t.node not in own]
         self._drop([(i, "its submap was removed") for i in [*placed, *inside]])
         self._leave_points(self.graph.submap(s.key))
 
@@ -381,8 +381,8 @@ class GpsFactors(SensorFactors):
                 cov = np.zeros_like(cov)
             # of an anisotropic fix only the arm's covariance, until the datum gives the rotation between the frames
             covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
-            self.tied.append(AttachedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
-        self.tie_points(s)
+            self.attached.append(AttachedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
+        self.attach_points(s)
         return dropped
 
     def _inner_point(self, s: SubmapNode, fix: PendingFix) -> int | None:
@@ -392,7 +392,7 @@ class GpsFactors(SensorFactors):
         return None if k is None else self.row_of_point(s, k)
 
     def row_of_point(self, s: SubmapNode, k: int) -> int:
-        """Row of path point k of a submap, created if needed (:meth:`tie_points` must follow)."""
+        """Row of path point k of a submap, created if needed (:meth:`attach_points` must follow)."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
         assert inner is not None
@@ -408,7 +408,7 @@ class GpsFactors(SensorFactors):
         k = next(k for k, other in enumerate(submaps) if other.key == s.key)
         submaps[k] = replace(submaps[k], inner_points=inner)
 
-    def tie_points(self, s: SubmapNode) -> None:
+    def attach_points(self, s: SubmapNode) -> None:
         """Connect the used path points of a submap to its end pose and landmarks with one factor."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
@@ -450,23 +450,23 @@ class GpsFactors(SensorFactors):
                 self._keep(other, replace(other.inner_points, rows=rows))
         if any(other.key == s.key for other in g.submaps):
             self._keep(s, replace(inner, factor_id=None, rows={}))
-        self.tied = [t if t.point is None else replace(t, point=new[t.point]) for t in self.tied]
+        self.attached = [t if t.point is None else replace(t, point=new[t.point]) for t in self.attached]
         g.values["point"] = g.values["point"][kept]
         g.revision += 1
 
     def _datum_if_ready(self, poses: Array, origin: Array, baseline: float) -> Array | None:
         """Initial ``T_gps_world`` from the attached fixes, once they span ``baseline`` in both frames."""
-        if len(self.tied) < 2:
+        if len(self.attached) < 2:
             return None
         group = group_of(poses)
-        world = group.transform(poses[[t.node for t in self.tied]], np.array([t.arm for t in self.tied]))
-        fixes = np.array([t.fix.position for t in self.tied]) - origin
+        world = group.transform(poses[[t.node for t in self.attached]], np.array([t.arm for t in self.attached]))
+        fixes = np.array([t.fix.position for t in self.attached]) - origin
         if (
             min(greatest_distance(world[:, :2]), greatest_distance(fixes[:, :2])) < baseline
         ):  # only a horizontal extent determines the heading
             return None
-        fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.tied]
-        sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.tied, fix)])
+        fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.attached]
+        sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.attached, fix)])
         return level_datum(world, fixes, sigma)
 
     def _bias_of(self, fix: PendingFix) -> int | None:

@@ -63,7 +63,7 @@ class PendingMeasurements(SensorFactors):
         self.waiting: list[PendingMeasurement] = []
 
     @abstractmethod
-    def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
+    def attach(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
         """Make the factor of a reading; ``T_node_body`` ``(1, 3|7)`` with its ``covariance`` ``(1, d, d)``."""
 
     @abstractmethod
@@ -114,7 +114,7 @@ class PendingMeasurements(SensorFactors):
             except DataError:
                 outside.append(r)
                 continue
-            self.tie(r, submap.nodes[int(at[0])], T, P)
+            self.attach(r, submap.nodes[int(at[0])], T, P)
         self.drop(outside, "outside the submap's trajectory")
         self.drop(spent, "its submap uses the stream already")
 

@@ -177,7 +177,7 @@ def piece_of_scans(scans: Iterable[Scan], pose: Array, config: SurfaceConfig) ->
         parts.append(se3.se3_transform(back, p[near]))
         origins.append(se3.se3_transform(back, o[near]))
     if not parts:
-        return _settled(np.zeros((0, 3), np.int64), np.zeros((0, BRICK_VOXELS, COLUMNS), np.int32))
+        return _piece_of_sums(np.zeros((0, 3), np.int64), np.zeros((0, BRICK_VOXELS, COLUMNS), np.int32))
     own, seen_from = np.concatenate(parts), np.concatenate(origins)
     if config.data == "rays":
         return piece_of_planes(own, seen_from, np.zeros_like(own), np.ones(len(own), np.bool_), config)
@@ -206,10 +206,10 @@ def piece_of_planes(
         add_planes(p[flat], np.ascontiguousarray(normals[flat]), first, table, sums)
     if config.carving and len(where):
         count_passing_beams(p, beams, 2.5, first, table, sums)
-    return _settled(where[:, ::-1] + first, sums)
+    return _piece_of_sums(where[:, ::-1] + first, sums)
 
 
-def _settled(coordinates: Ints, sums: npt.NDArray[np.int32]) -> SurfacePiece:
+def _piece_of_sums(coordinates: Ints, sums: npt.NDArray[np.int32]) -> SurfacePiece:
     n = len(coordinates)
     distance, normal = np.zeros((n, BRICK_VOXELS), np.float32), np.zeros((n, BRICK_VOXELS, 3), np.int8)
     counts = np.zeros((n, BRICK_VOXELS, 3), np.uint16)

@@ -29,7 +29,7 @@ from graphslam_studies.montecarlo.trials import Measurement
 
 UNKNOWN = "unknown"
 """Name given to recorded logs, so that no preset applies."""
-SURELY = float(np.deg2rad(0.05))
+YAW_BIAS_SIGMA = float(np.deg2rad(0.05))
 """Largest σ of a yaw bias that counts as estimated [rad/s]."""
 PAIRS = 5000
 """Number of pairs of poses whose relative pose is scored."""
@@ -97,7 +97,7 @@ def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odomet
 
 
 def scanned(
-    source: str, presets: str, frontend: str, added: Added | None, first: float | None, ways: Sequence[str], seed: int
+    source: str, presets: str, frontend: str, added: Added | None, first: float | None, maps: Sequence[str], seed: int
 ) -> Iterator[Measurement]:
     """Calibrate a log of scans before and after errors are added to its odometry, and map it.
 
@@ -107,7 +107,7 @@ def scanned(
         None: random, from the seed.
     first : float or None
         Duration of the part of the log that is used [s]; None: all.
-    ways : sequence of str
+    maps : sequence of str
         Maps to make. Without added errors: with the preset (``preset``), or calibrated (``recorded``). With added
         errors: calibrated (``calibrated``), or with the preset (``stated``).
     """
@@ -135,8 +135,8 @@ def scanned(
         "calibrated": (worse, unknown),
         "stated": (worse, known),
     }
-    for variant in ways:
-        yield from _mapped(variant, *made[variant], frontend, seed)
+    for kind in maps:
+        yield from _mapped(kind, *made[kind], frontend, seed)
 
 
 def _measurements(
@@ -144,8 +144,8 @@ def _measurements(
 ) -> Iterator[Measurement]:
     """Errors of the estimated additions: difference between the two calibrations minus the true addition.
 
-    The yaw bias is scored only if both calibrations estimate it separately, with a combined σ below `SURELY`. The joint
-    effect of bias and turn per metre at the mean speed (``turning``) is always scored.
+    The yaw bias is scored only if both calibrations estimate it separately, with a combined σ below `YAW_BIAS_SIGMA`.
+    The joint effect of bias and turn per metre at the mean speed (``turning``) is always scored.
     """
     a, b = ({e.name: e for e in found.estimates} for found in (before, after))
     scale = float(np.exp(b["distance_scale"].value - a["distance_scale"].value))
@@ -154,7 +154,7 @@ def _measurements(
     yield Measurement(name, "distance_scale_sigma_told", sigma)
     yield Measurement(name, "distance_scale_applied", float(b["distance_scale"].applied))
     both = [x["yaw_bias"] for x in (a, b) if "yaw_bias" in x]
-    estimated = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < SURELY
+    estimated = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < YAW_BIAS_SIGMA
     yield Measurement(name, "yaw_bias_told", float(estimated))
     if estimated:
         yield Measurement(name, "yaw_bias_error", both[1].value - both[0].value - added.bias)

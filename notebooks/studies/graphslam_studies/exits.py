@@ -61,7 +61,7 @@ def drawn_robot(number: int, base: CrawlerConfig | None = None) -> tuple[Crawler
     return replace(c, **found), by["speed"]
 
 
-def told(robot: CrawlerConfig) -> DeadReckoningNoise:
+def assumed_noise(robot: CrawlerConfig) -> DeadReckoningNoise:
     """Noise parameters from the data sheet of a robot, which are not in its log."""
     return DeadReckoningNoise(wheel=robot.wheel_sigma, wheel_scale=robot.wheel_scale, attitude_bias=robot.attitude_bias)
 
@@ -70,7 +70,7 @@ def run_exits_trial(config: ExitsTrialConfig, seed: int) -> list[Measurement]:
     """All metrics of one run."""
     grid = config.grid
     robot, speed = drawn_robot(config.robot, grid.crawler)
-    steps = replace(grid.steps, noise=told(robot))
+    steps = replace(grid.steps, noise=assumed_noise(robot))
     with one_blas_thread():
         return list(GridTrial(replace(grid, crawler=robot, speed=speed, steps=steps), seed).run())
 

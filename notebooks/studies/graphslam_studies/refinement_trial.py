@@ -50,7 +50,7 @@ ROBOTS = {
 FAULTS = ("mount", "clock", "moving")
 WRONG_SIGMA = (0.005, 0.005, 0.005, 0.02, 0.02, 0.02)
 """σ of a wrong loop closure in the graph [rad], [m]."""
-SETTLED = 10
+UNSCORED = 10
 """Number of first steps that are not scored, because the anchored path has almost no error there."""
 APART = 30.0
 """Time between poses whose relative error is scored [s]."""
@@ -217,8 +217,8 @@ class RefinementTrial(GraphTrial):
 def nees_of(found: Refinement, true: Array) -> dict[str, float]:
     """NEES per degree of freedom, mean over the steps: anchored, by block, and relative over 30 s."""
     g = group_of(found.poses)
-    e = g.log(g.between(found.poses, true))[SETTLED:]
-    C = found.covariances[SETTLED:]
+    e = g.log(g.between(found.poses, true))[UNSCORED:]
+    C = found.covariances[UNSCORED:]
     blocks = {"nees": slice(0, 6), "nees_level": slice(0, 2), "nees_heading": slice(2, 3), "nees_plan": slice(3, 5)}
     blocks["nees_height"] = slice(5, 6)
     out = {}

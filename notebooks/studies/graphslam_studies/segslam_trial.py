@@ -157,7 +157,7 @@ class GridTrial:
         self.seconds_steps = perf_counter() - begin
         assert self.steps.truth is not None
         self.truth = self.steps.truth.interpolate(self.steps.times)
-        self.arc = judge.steps_of_way(self.steps.truth, self.steps.times, self.world.route().length)
+        self.arc = judge.steps_of_path(self.steps.truth, self.steps.times, self.world.route().length)
 
     def run(self) -> Iterator[Measurement]:
         """Metrics of every algorithm; if one fails with an error, only ``failed`` = 1."""

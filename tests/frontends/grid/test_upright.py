@@ -12,7 +12,7 @@ from graphslam.core.random import SeedTree
 from graphslam.evidence.likelihood import log_weights
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
-from graphslam_frontends.grid.upright import NEIGHBOURS, SURE, up_directions, upright_beams
+from graphslam_frontends.grid.upright import NEIGHBOURS, NORMAL_SIGMA, up_directions, upright_beams
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
@@ -36,7 +36,7 @@ def slow(steps: Steps) -> np.ndarray:
             near = steps.points[rows[np.argsort(distance, kind="stable")[:NEIGHBOURS]]]
             _, s, axes = np.linalg.svd(near - near.mean(axis=0))
             lies = np.degrees(np.arccos(min(abs(axes[2] @ up), 1.0))) <= 45.0
-            out[r] = not (lies and s[2] ** 2 <= NEIGHBOURS * SURE**2 * s[1] ** 2)
+            out[r] = not (lies and s[2] ** 2 <= NEIGHBOURS * NORMAL_SIGMA**2 * s[1] ** 2)
     return out
 
 

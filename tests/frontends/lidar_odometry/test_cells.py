@@ -47,12 +47,12 @@ def test_cells_are_those_of_the_plain_twin(made):
     alone = plain_cells(points, c.size, c.least, c.planes)[1]
     assert np.count_nonzero(np.abs(information - alone).max(axis=(1, 2)) > 0) > 10  # rows that surfaces are told of
     # the fast ones are told anew only every quarter of their points
-    told = level.cells.told[: level.cells.used[0]] > 0
+    told = level.cells.updated[: level.cells.used[0]] > 0
     assert np.count_nonzero(told) == len(centres) == len(level)
     tree = cKDTree(centres)
     _, at = tree.query(level.centres)
     assert len(set(at)) == len(at)
-    full = level.cells.told[: level.cells.used[0]][told] == level.cells.number[: level.cells.used[0]][told]
+    full = level.cells.updated[: level.cells.used[0]][told] == level.cells.number[: level.cells.used[0]][told]
     assert full.sum() > 10
     np.testing.assert_allclose(level.centres[full], centres[at[full]], atol=1e-12)
     root = level.cells.root[: level.cells.used[0]][told][full]

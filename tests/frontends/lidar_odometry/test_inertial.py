@@ -101,7 +101,7 @@ def test_a_running_product_is_that_of_a_loop(rng):
 def test_a_way_is_that_of_preintegration(rng):
     imu, bias = shaken(rng), np.array([0.02, -0.01, 0.03])
     begin, ends = 0.1234, np.array([0.3, 0.777, 1.5])
-    way = ImuReadings(imu).way(begin, ends, bias)
+    way = ImuReadings(imu).motion(begin, ends, bias)
     twin = preintegrate(imu, np.full(3, begin), ends, np.concatenate([bias, np.zeros(3)]))
     np.testing.assert_allclose(se3.quat_to_matrix(way.q), twin.R, atol=1e-9)
     np.testing.assert_allclose(way.v, twin.v, atol=2e-5)
@@ -110,12 +110,12 @@ def test_a_way_is_that_of_preintegration(rng):
 
 def test_a_way_backwards_undoes_the_way_there(rng):
     readings, v, g = ImuReadings(shaken(rng)), np.array([1.0, -0.5, 0.2]), np.array([0.3, 0.1, -9.8])
-    there = readings.way(0.4, np.array([0.9]), np.zeros(3))
+    there = readings.motion(0.4, np.array([0.9]), np.zeros(3))
     T = there.poses(v, g)[0]
     # velocity and gravity as the body has them at the other end
     back = T[3:] * [-1.0, -1.0, -1.0, 1.0]
     v1, g1 = se3.quat_rotate(back, v + 0.5 * g + there.v[0]), se3.quat_rotate(back, g)
-    S = readings.way(0.9, np.array([0.4]), np.zeros(3)).poses(v1, g1)[0]
+    S = readings.motion(0.9, np.array([0.4]), np.zeros(3)).poses(v1, g1)[0]
     np.testing.assert_allclose(se3.se3_log(se3.se3_compose(T, S)), 0.0, atol=1e-9)
 
 
@@ -128,7 +128,7 @@ def test_readings_of_a_mounted_unit_are_those_of_the_base():
     T0, dt = truth.interpolate(np.array([t0]))[0], 0.005
     v = (truth.interpolate(np.array([t0 + dt]))[0, :3] - truth.interpolate(np.array([t0 - dt]))[0, :3]) / (2 * dt)
     to_body = T0[3:] * [-1.0, -1.0, -1.0, 1.0]
-    found = readings.way(t0, at, np.zeros(3)).poses(
+    found = readings.motion(t0, at, np.zeros(3)).poses(
         se3.quat_rotate(to_body, v), se3.quat_rotate(to_body, np.array([0, 0, -GRAVITY]))
     )
     off = se3.se3_log(se3.se3_between(found, se3.se3_between(np.tile(T0, (2, 1)), truth.interpolate(at))))
@@ -139,10 +139,10 @@ def test_readings_of_a_mounted_unit_are_those_of_the_base():
 def test_no_way_over_a_pause_or_beyond_the_readings(rng):
     imu = shaken(rng)
     paused = ImuReadings(imu.take(np.r_[0:100, 160:400]))
-    assert paused.way(0.1, np.array([0.4]), np.zeros(3)) is not None
-    assert paused.way(0.1, np.array([0.9]), np.zeros(3)) is None
-    assert ImuReadings(imu).way(0.1, np.array([2.5]), np.zeros(3)) is None
-    assert ImuReadings(imu.take(slice(0, 1))).way(0.0, np.array([0.0]), np.zeros(3)) is None
+    assert paused.motion(0.1, np.array([0.4]), np.zeros(3)) is not None
+    assert paused.motion(0.1, np.array([0.9]), np.zeros(3)) is None
+    assert ImuReadings(imu).motion(0.1, np.array([2.5]), np.zeros(3)) is None
+    assert ImuReadings(imu.take(slice(0, 1))).motion(0.0, np.array([0.0]), np.zeros(3)) is None
 
 
 def test_velocity_and_gravity_are_those_of_the_positions(rng):

@@ -177,7 +177,7 @@ def test_gps_inside_a_submap_that_used_it_is_refused(rng):
     with pytest.raises(EvidenceReusedError, match="gps"):
         g.add_sensor(gps)
     assert g.revision == revision
-    assert not GpsFactors.of(g).tied
+    assert not GpsFactors.of(g).attached
     g.add_sensor(gps.take(gps.times < 10.0))
     with pytest.raises(EvidenceReusedError, match="second time"):
         g.add_sensor(gps.take(gps.times < 10.0))

@@ -213,7 +213,7 @@ def match_errors(segmap: SegMap, truth: Array) -> MatchErrors:
 # --- the way -------------------------------------------------------------------------------------------------
 
 
-def steps_of_way(truth: Trajectory, times: Array, length: float) -> Array:
+def steps_of_path(truth: Trajectory, times: Array, length: float) -> Array:
     """Arc length of the way at every step ``(n,)`` [m], from the truth; the end of the truth is that of the way."""
     driven = arc_length(truth.positions)
     return np.asarray(np.interp(times, truth.times, driven * (length / driven[-1])))

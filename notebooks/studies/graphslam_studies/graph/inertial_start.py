@@ -51,16 +51,16 @@ def inertial_start(imu: Imu, times: Array, positions: Array) -> tuple[Array, Arr
     sigma, stretch = bias_sigma(imu.noise)[:3], min(FIRST, n)
     # over a long first stretch an unknown bias turns by radians, so that several are tried
     starts = np.concatenate([np.zeros((1, 3)), np.diag(sigma), -np.diag(sigma)])
-    tried = [_settled(imu, times[:stretch], positions[:stretch], start) for start in starts]
+    tried = [_converged(imu, times[:stretch], positions[:stretch], start) for start in starts]
     while True:
         _, bias, R = min(tried, key=lambda found: found[0])
         if stretch == n:
             return matrix_to_quat(R), bias
         stretch = min(2 * stretch, n)
-        tried = [_settled(imu, times[:stretch], positions[:stretch], bias)]
+        tried = [_converged(imu, times[:stretch], positions[:stretch], bias)]
 
 
-def _settled(imu: Imu, times: Array, positions: Array, bias: Array) -> tuple[float, Array, Array]:
+def _converged(imu: Imu, times: Array, positions: Array, bias: Array) -> tuple[float, Array, Array]:
     """Cost, bias and first attitude after some Gauss–Newton steps from a bias; a large one is dear, as its σ says."""
     weight = (SPEED_SIGMA / bias_sigma(imu.noise)[:3]) ** 2
     for _ in range(ROUNDS):

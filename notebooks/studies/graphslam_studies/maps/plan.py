@@ -47,7 +47,7 @@ def plan_vehicle_path(costs: CostMap, start: Array, goal: Array) -> PlannedPath 
     graph = import_extra("skimage.graph", "a way over terrain")
     ends = [costs.index(g) for g in np.atleast_2d(goal)]
     ends = [b for b in ends if np.isfinite(costs.cost[b])]
-    a = _way_out(costs, costs.index(start))
+    a = _nearest_open(costs, costs.index(start))
     if not ends or a is None:
         return None
     search = graph.MCP_Geometric(np.where(np.isfinite(costs.cost), costs.cost, -1.0))
@@ -63,7 +63,7 @@ def plan_vehicle_path(costs: CostMap, start: Array, goal: Array) -> PlannedPath 
     return PlannedPath(points, float(totals[b]) * costs.cell, length)
 
 
-def _way_out(costs: CostMap, a: tuple[int, int]) -> tuple[int, int] | None:
+def _nearest_open(costs: CostMap, a: tuple[int, int]) -> tuple[int, int] | None:
     """The open cell nearest to a cell, itself if it is open."""
     if np.isfinite(costs.cost[a]):
         return a

@@ -62,7 +62,7 @@ class _Leg:
         (a, b), (c, d) = self.place(u0, v0), self.place(u1, v1)
         return (min(a, c), min(b, d), max(a, c), max(b, d))
 
-    def way(self) -> list[tuple[float, float, float]]:
+    def points(self) -> list[tuple[float, float, float]]:
         """Out, round the room at the end, and back."""
         near, far, half = self.end + _ROUND[0], self.end + _END_LENGTH - _ROUND[0], _ROUND[1]
         corners = [(near, 0.0), (near, -half), (far, -half), (far, half), (near, half), (near, 0.0)]
@@ -235,7 +235,7 @@ def _waypoints() -> list[tuple[float, float, float]]:
     for level in range(_LEVELS):
         z = level * STOREY
         east, north, west = (leg for leg in _LEGS if leg.level == level)
-        points += [(_LANE, 0.0, z), *east.way(), (0.0, 0.0, z), *north.way(), (0.0, 0.0, z), *west.way()]
+        points += [(_LANE, 0.0, z), *east.points(), (0.0, 0.0, z), *north.points(), (0.0, 0.0, z), *west.points()]
         if level < _LEVELS - 1:
             points += [(-_LANE, 0.0, z), *_climb(level)]
     for level in range(_LEVELS - 2, -1, -1):

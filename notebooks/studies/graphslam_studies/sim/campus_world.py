@@ -55,7 +55,7 @@ def campus(config: CampusConfig, *, seed: int = 0) -> World:
     mesh = MeshBuilder()
     edge = 30.0
     mesh.box((-edge, -edge, -1.0), (config.size[0] + edge, config.size[1] + edge, 0.0))
-    paths = _ways(plan)
+    paths = _drivable(plan)
     for b in plan.blocks:
         rng = tree.child("block", b.column, b.row).generator()
         if b.open:
@@ -94,7 +94,7 @@ def _corridor_of(b: Block) -> dict[str, object]:
     return {"corner": list(b.place(uc, vc)), "ends": [list(e) for e in ends], "angle": np.pi / 2, "floor": b.floor}
 
 
-def _ways(plan: Campus) -> Array:
+def _drivable(plan: Campus) -> Array:
     """Points close together on everything a robot may drive over ``(n, 3)``."""
     lines = [np.array([[*a, 0.0], [*b, 0.0]]) for a, b in plan.streets()]
     lines += [b.passage(plan.street) for b in plan.blocks if b.open]

@@ -31,7 +31,7 @@ _LEANS = 3
 class Command:
     """A way ``(k, 2)`` that begins where the robot will be, in its own map [m], and the speed to come to [m/s]."""
 
-    way: Array
+    path: Array
     speed: float
 
 
@@ -120,7 +120,7 @@ class StreetRover:
 
     def _follow(self, state: RoverState, command: Command, steps: int, *, beyond: int) -> tuple[RoverState, Array]:
         """State after some steps, and planar poses of these and a few more ``(steps + beyond, 3)``."""
-        path = command.way
+        path = command.path
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         along, v, yaw = state.along, state.speed, state.yaw
         out, new = np.empty((steps + beyond, 3)), state
