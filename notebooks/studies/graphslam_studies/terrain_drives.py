@@ -16,7 +16,7 @@ for 7 s, or after 90 s.
 Quantities
 ----------
 ``fall``, ``curb``, ``crash``, ``steep``: 1 if a circle as wide as the vehicle touched a fall, a step up, an obstacle,
-or ground that is too steep. ``arrived``; ``path``: 1 if a path exists on the true map; ``right``: 1 if it arrived and a
+or ground that is too steep. ``arrived``; ``way``: 1 if a path exists on the true map; ``right``: 1 if it arrived and a
 path exists, or did not arrive, without harm, and none exists. ``coverage``: known share of the free lane 0.8–8 m ahead,
 within ±60°, mean over plans. ``speed``: mean while there was a plan [m/s]. ``detour``: if arrived, length driven over
 the length of the best path on the true map; ``cost``: ratio of the costs of these paths on that map.
