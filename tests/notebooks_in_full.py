@@ -36,14 +36,14 @@ def main() -> int:
                 failed += 1
         folder = asked.out / path.stem
         folder.mkdir(parents=True, exist_ok=True)
-        said = [error] if error else []
+        texts = [error] if error else []
         for cell in (c for c in book.cells if c.cell_type == "code"):
             for k, output in enumerate(cell.get("outputs", ())):
                 data = output.get("data", {})
-                said.append(f"--- {cell.id}\n{output.get('text', '') or data.get('text/plain', '')}")
+                texts.append(f"--- {cell.id}\n{output.get('text', '') or data.get('text/plain', '')}")
                 if "image/png" in data:
                     (folder / f"{cell.id}-{k}.png").write_bytes(base64.b64decode(data["image/png"]))
-        (folder / "said.txt").write_text("\n".join(said), encoding="utf-8")
+        (folder / "said.txt").write_text("\n".join(texts), encoding="utf-8")
         print(f"{path.stem:30} {time.perf_counter() - started:6.0f} s {'FAILED' if error else ''}", flush=True)
     print(f"all: {(time.perf_counter() - begin) / 60:.1f} min")
     return 1 if failed else 0

@@ -57,8 +57,8 @@ def built(clone: Path) -> tuple[Path, Path]:
     """Wheel and sdist of the clone."""
     out = clone.parent / "dist"
     pytest.importorskip("hatchling")
-    said = run("-m", "hatchling", "build", "-d", out, cwd=clone, python=Path(sys.executable))
-    assert "warn" not in said.lower()
+    output = run("-m", "hatchling", "build", "-d", out, cwd=clone, python=Path(sys.executable))
+    assert "warn" not in output.lower()
     (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
     return wheel, sdist
 
@@ -125,7 +125,7 @@ def test_install_run_uninstall_and_editable_install(built: tuple[Path, Path], en
     assert run(command, "--version", cwd=parent) == run("-m", "graphslam", "--version", cwd=clone, python=python)
     (parent / "script.py").write_text("import graphslam\nprint(graphslam.__file__, graphslam.simulate.__name__)\n")
     for folder in (parent, clone):  # the clone itself would be an empty package for whoever stands in its parent
-        said = run(parent / "script.py", cwd=folder, python=python)
-        assert said.split() == [str(clone / "graphslam" / "__init__.py"), "simulate"]
+        output = run(parent / "script.py", cwd=folder, python=python)
+        assert output.split() == [str(clone / "graphslam" / "__init__.py"), "simulate"]
     checks = json.loads(run(command, "doctor", "--json", cwd=parent))["checks"]
     assert {c["state"] for c in checks} <= {"ok", "absent"}

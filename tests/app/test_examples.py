@@ -40,17 +40,17 @@ def test_example_of_a_public_name_runs(name: str, folder: dict[str, Any]) -> Non
     (found,) = finder.find(thing, name, globs=dict(folder))
     assert found.examples, f"{name} has no example"
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-    said: list[str] = []
-    doctest.DocTestRunner(optionflags=flags, verbose=False).run(found, out=said.append)
-    assert not said, "".join(said)
+    failures: list[str] = []
+    doctest.DocTestRunner(optionflags=flags, verbose=False).run(found, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - TYPES))
 def test_a_verb_says_what_comes_out_and_what_goes_wrong(name: str) -> None:
     """Types say it of their fields; lists of names cannot fail."""
-    said = getattr(gs, name).__doc__ or ""
+    doc = getattr(gs, name).__doc__ or ""
     if isinstance(getattr(gs, name), type):
         return
     if name not in ("front_ends", "joiners", "solvers", "worlds"):
-        assert "Returns\n    -------" in said
-        assert "Raises\n    ------" in said
+        assert "Returns\n    -------" in doc
+        assert "Raises\n    ------" in doc

@@ -124,12 +124,12 @@ def test_a_run_with_a_dense_map_is_read_back(hall: Run, tmp_path: Path, form: st
     export(hall, format="nav2", out=tmp_path / "nav")
     plans = [read_map_server(f) for f in sorted((tmp_path / "nav").glob("*.yaml"))]
     assert len(plans) == len(maps)
-    for topic, (cells, said) in zip(maps, plans):
+    for topic, (cells, info) in zip(maps, plans):
         ((_, m),) = found[topic]
         assert m.header.frame_id == "map"
         np.testing.assert_array_equal(m.data.reshape(m.info.height, m.info.width), cells)
-        np.testing.assert_allclose(pose_of(m.info.origin)[:2], said["origin"][:2])
-        assert m.info.resolution == pytest.approx(said["resolution"])
+        np.testing.assert_allclose(pose_of(m.info.origin)[:2], info["origin"][:2])
+        assert m.info.resolution == pytest.approx(info["resolution"])
 
 
 @pytest.mark.parametrize("form", ["mcap", "ros2"])

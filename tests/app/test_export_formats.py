@@ -48,10 +48,10 @@ def test_nav2_reads_the_floor_plans(hall: Run, tmp_path: Path) -> None:
     found = sorted((tmp_path / "nav").glob("*.yaml"))
     assert found
     for file in found:
-        cells, said = read_map_server(file)
-        assert said["mode"] == "trinary"
+        cells, info = read_map_server(file)
+        assert info["mode"] == "trinary"
         assert set(np.unique(cells)) == {-1, 0, 100}
-        at = np.floor((hall.map.trajectory.poses[:, :2] - said["origin"][:2]) / said["resolution"]).astype(int)
+        at = np.floor((hall.map.trajectory.poses[:, :2] - info["origin"][:2]) / info["resolution"]).astype(int)
         # where it drove it is free, as far as the plan goes
         driven = at[np.all((at >= 0) & (at < cells.shape[::-1]), axis=1)]
         assert len(driven) > 0.9 * len(at)

@@ -36,13 +36,13 @@ def test_tab_completion_offers_these_and_no_more() -> None:
 @pytest.mark.parametrize("name", sorted(VERBS | LISTS | TYPES))
 def test_help_teaches(name: str) -> None:
     """A first sentence, what goes in, and a short example."""
-    said = inspect.getdoc(getattr(gs, name)) or ""
+    doc = inspect.getdoc(getattr(gs, name)) or ""
     if name == "FactorGraph":  # in its module
-        said += inspect.getmodule(gs.FactorGraph).__doc__ or ""  # type: ignore[union-attr]
-    assert said.split("\n")[0].rstrip().endswith((".", ":"))
-    assert "Examples\n--------" in said
+        doc += inspect.getmodule(gs.FactorGraph).__doc__ or ""  # type: ignore[union-attr]
+    assert doc.split("\n")[0].rstrip().endswith((".", ":"))
+    assert "Examples\n--------" in doc
     if name in VERBS:
-        assert "Parameters\n----------" in said
+        assert "Parameters\n----------" in doc
 
 
 @pytest.mark.parametrize("name", sorted(STREAMS))

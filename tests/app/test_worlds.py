@@ -93,11 +93,11 @@ def test_from_the_command_line(tmp_path: Path) -> None:
     arguments = ["simulate", "garage", "--layout", "B", "--seed", "1", "--set", "scan_rate=0.5", "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 0, result.output
-    said = json.loads(result.stdout)
+    printed = json.loads(result.stdout)
     log = gs.load(out)
-    assert said["streams"] == {k: len(s.times) for k, s in log.streams.items()}
+    assert printed["streams"] == {k: len(s.times) for k, s in log.streams.items()}
     assert log.meta["made_with"] == {"name": "garage", "layout": "B", "seed": 1}
-    assert said["meta"]["noise"] == log.meta["noise"]
+    assert printed["meta"]["noise"] == log.meta["noise"]
     assert (out / "mesh.ply").is_file()
 
 

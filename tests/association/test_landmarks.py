@@ -86,34 +86,34 @@ def slow_search(
 ) -> tuple[list[int], float, float]:
     """The greedy search by explicit conditioning with inverses: pairings, score, cost."""
 
-    def conditional(k: int, taken: list[int]) -> tuple[float, float]:
+    def conditional(k: int, paired: list[int]) -> tuple[float, float]:
         a = np.array([2 * k, 2 * k + 1])
         nu, C = p.innovation.ravel(), p.covariance
-        if not taken:
+        if not paired:
             v, S = nu[a], C[np.ix_(a, a)]
         else:
-            b = np.concatenate([[2 * t, 2 * t + 1] for t in taken])
+            b = np.concatenate([[2 * t, 2 * t + 1] for t in paired])
             K = C[np.ix_(a, b)] @ np.linalg.inv(C[np.ix_(b, b)])
             v, S = nu[a] - K @ nu[b], C[np.ix_(a, a)] - K @ C[np.ix_(b, a)]
         return float(v @ np.linalg.inv(S) @ v), float(np.log(np.linalg.det(S)))
 
-    taken, total, pick = [], 0.0, seed
+    paired, total, pick = [], 0.0, seed
     score = cost = 0.0
     while True:
-        d2, volume = conditional(pick, taken)
-        if total + d2 > limit[len(taken) + 1]:
-            return taken, score, cost
+        d2, volume = conditional(pick, paired)
+        if total + d2 > limit[len(paired) + 1]:
+            return paired, score, cost
         total, score, cost = total + d2, score + gate - d2, cost + d2 + volume
-        taken.append(pick)
+        paired.append(pick)
         best = (np.inf, -1)
         for k in range(len(p.observed)):
-            if any(p.observed[k] == p.observed[t] or p.target[k] == p.target[t] for t in taken):
+            if any(p.observed[k] == p.observed[t] or p.target[k] == p.target[t] for t in paired):
                 continue
-            e2, logdet = conditional(k, taken)
-            if e2 <= gate and not (persistent and total + e2 > limit[len(taken) + 1]):
+            e2, logdet = conditional(k, paired)
+            if e2 <= gate and not (persistent and total + e2 > limit[len(paired) + 1]):
                 best = min(best, (e2 + logdet, k))
         if best[1] < 0:
-            return taken, score, cost
+            return paired, score, cost
         pick = best[1]
 
 
@@ -146,11 +146,11 @@ def test_search_is_its_slow_twin(rng, persistent):
             p.observed, p.target, p.innovation, p.covariance, seeds, 11.8, limit, persistent=persistent
         )
         for s in seeds:
-            taken, value, cost = slow_search(p, int(s), 11.8, limit, persistent=persistent)
-            assert found.of(s).tolist() == taken
+            paired, value, cost = slow_search(p, int(s), 11.8, limit, persistent=persistent)
+            assert found.of(s).tolist() == paired
             assert found.score[s] == pytest.approx(value, abs=1e-6)
             assert found.cost[s] == pytest.approx(cost, abs=1e-6)
-            differ += len(slow_search(p, int(s), 11.8, limit, persistent=not persistent)[0]) != len(taken)
+            differ += len(slow_search(p, int(s), 11.8, limit, persistent=not persistent)[0]) != len(paired)
     assert differ > 0  # the limits are tight enough for persistence to matter
 
 

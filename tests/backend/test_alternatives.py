@@ -144,11 +144,11 @@ def test_chi2_of_a_graph_without_kernels_is_its_objective(run: tuple) -> None:
 
 def test_most_ties_say_how_good_the_chain_is() -> None:
     """Sixteen ties over a chain that states a third of its variance; one of them is wrong."""
-    ties = [16, 15, 15, 0]
+    counts = [16, 15, 15, 0]
     fits = [(900.0, 48), (140.0, 45), (860.0, 45), (0.0, 0)]
-    assert noise_scale(ties, fits) == pytest.approx(140.0 / 45)
+    assert noise_scale(counts, fits) == pytest.approx(140.0 / 45)
     assert noise_scale([4, 3, 0], [(900.0, 12), (140.0, 9), (0.0, 0)]) == 1.0  # too few to tell
-    assert noise_scale(ties, [(30.0, 48), (29.0, 45), (28.0, 45), (0.0, 0)]) == 1.0  # no chain is too good
+    assert noise_scale(counts, [(30.0, 48), (29.0, 45), (28.0, 45), (0.0, 0)]) == 1.0  # no chain is too good
     # those that dropped most of the ties have no say
     assert noise_scale([16, 5], [(160.0, 48), (15.0, 15)]) == pytest.approx(160 / 48)
 

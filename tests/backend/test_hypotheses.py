@@ -32,8 +32,8 @@ DIVISION = DivisionConfig(reach=8.5)
 
 
 def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[TopologyHypothesis], list[Alternative]]:
-    told, _ = hypotheses_of(result, most, drift=COURT, **options)
-    return told, solve_hypotheses(told, CONFIG, division=DIVISION)
+    hypotheses, _ = hypotheses_of(result, most, drift=COURT, **options)
+    return hypotheses, solve_hypotheses(hypotheses, CONFIG, division=DIVISION)
 
 
 @pytest.fixture(scope="module")
@@ -65,26 +65,26 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
     found = topologies(divided)
     assert len(found) == 2
     assert sum(support for _, support, _ in found) == pytest.approx(divided.weights.sum())
-    said = [[entry[2] for entry in topology(divided.segmap, chain)][-1] for *_, chain in found]
-    assert set(said) == {"new", "match"}
+    last = [[entry[2] for entry in topology(divided.segmap, chain)][-1] for *_, chain in found]
+    assert set(last) == {"new", "match"}
     for p, support, chain in found:
-        told = topology(divided.segmap, chain)
-        assert all(a[1] == b[0] for a, b in pairwise(told))  # each goes on where the one before ended
+        entries = topology(divided.segmap, chain)
+        assert all(a[1] == b[0] for a, b in pairwise(entries))  # each goes on where the one before ended
         same = [
             k for k in range(8)
-            if topology(divided.segmap, common_ancestor_chain(divided.segmap, int(divided.closed[k]))) == told
+            if topology(divided.segmap, common_ancestor_chain(divided.segmap, int(divided.closed[k]))) == entries
         ]  # fmt: skip
         assert support == pytest.approx(divided.weights[same].sum())
         assert p == max(same, key=lambda k: divided.weights[k])
 
 
 def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlamResult) -> None:
-    told, graphs = solved(result)
-    assert len(told) == len(graphs) == 2
+    hypotheses, graphs = solved(result)
+    assert len(hypotheses) == len(graphs) == 2
     choice = rank_alternatives(graphs)
     assert [j.alternative.name for j in choice.order] == ["hypothesis 0", "hypothesis 1"]
     assert choice.best_map.entropy() == pytest.approx(choice.best.clarity.entropy)
-    closed, open_chain = told
+    closed, open_chain = hypotheses
     assert closed.withdrawn is None
     assert open_chain.withdrawn == closed.entries[0]
     assert [a.facts["loops"] > 0 for a in graphs] == [True, False]
@@ -108,20 +108,20 @@ def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlam
 
 def test_map_samples_become_graphs_too(trial: GridTrial, result: SegSlamResult) -> None:
     """Chains of segments of several particles, each different, all solved before they are compared."""
-    told, left_out = hypotheses_of(result, 1, drift=COURT, samples=6)
+    hypotheses, left_out = hypotheses_of(result, 1, drift=COURT, samples=6)
     assert left_out == 0
-    sampled = [h for h in told if h.particle == -1]
+    sampled = [h for h in hypotheses if h.particle == -1]
     assert 1 <= len(sampled) <= 6
-    assert len(told) == 1 + len(sampled)
-    assert len({h.chain.tobytes() for h in told}) == len(told)
+    assert len(hypotheses) == 1 + len(sampled)
+    assert len({h.chain.tobytes() for h in hypotheses}) == len(hypotheses)
     segmap = result.segmap
     for h in sampled:
         bounds = [segmap[int(i)].interval for i in h.chain]
         assert all(a[1] == b[0] for a, b in pairwise(bounds))
         assert (bounds[0][0], bounds[-1][1]) == (0, max(b for _, b in bounds))
         # what a sample stands for is the share of the particles that tell the same
-        assert h.support == pytest.approx(told[0].support)
-    few = solve_hypotheses(told[:2], CONFIG, division=DIVISION)
+        assert h.support == pytest.approx(hypotheses[0].support)
+    few = solve_hypotheses(hypotheses[:2], CONFIG, division=DIVISION)
     assert few[0].solution.trajectory().times[-1] == few[1].solution.trajectory().times[-1]
     sample = result.sample(0)
     assert sorted(sample.segments.tolist()) == sorted(sampled_chain(segmap, sample).tolist())

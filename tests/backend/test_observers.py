@@ -24,19 +24,19 @@ class Listener(Observer):
     """Writes down what it is told."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, Any]] = []
+        self.calls: list[tuple[str, Any]] = []
 
     def front_end_at(self, progress: Any) -> None:
-        self.told.append(("step", progress))
+        self.calls.append(("step", progress))
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
-        self.told.append(("submap", (submap.key, len(graph.submaps))))
+        self.calls.append(("submap", (submap.key, len(graph.submaps))))
 
     def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
-        self.told.append(("loop", decision.loop))
+        self.calls.append(("loop", decision.loop))
 
     def solved(self, solution: Solution) -> None:
-        self.told.append(("solved", len(solution.poses)))
+        self.calls.append(("solved", len(solution.poses)))
 
 
 class Watched(Ring):
@@ -55,12 +55,12 @@ def test_submaps_steps_and_the_solution_are_reported_in_order(monkeypatch: pytes
     heard = Listener()
     r = gs.run(log, frontend="ring", progress=[heard, Observer()], out=tmp_path / "run")
     n = len(front.made)
-    told = [("step", k) if first else ("submap", (k, k + 1)) for k in range(n) for first in (True, False)]
-    assert heard.told == [*told, ("solved", len(r.solution.poses))]
+    expected = [("step", k) if first else ("submap", (k, k + 1)) for k in range(n) for first in (True, False)]
+    assert heard.calls == [*expected, ("solved", len(r.solution.poses))]
     # a resumed run tells of the submaps that are there already; and it is the same run without a listener
     again = Listener()
     back = gs.run(log, frontend="ring", progress=[again], out=tmp_path / "run", resume=True)
-    assert again.told == [x for x in heard.told if x[0] != "step"]
+    assert again.calls == [x for x in heard.calls if x[0] != "step"]
     alone = gs.run(log, frontend="ring", progress=False)
     np.testing.assert_array_equal(back.map.node_poses, alone.map.node_poses)
     np.testing.assert_array_equal(r.map.node_poses, alone.map.node_poses)

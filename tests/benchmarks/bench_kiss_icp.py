@@ -68,12 +68,12 @@ def recorded(most: int) -> None:
             spent = (time.process_time() - begin) / len(times)
             paths[name] = run.map.trajectory.interpolate(times)
             end = float(np.linalg.norm(paths[name][-1, :3] - paths[name][0, :3]))
-            said = [f"end to start {end:.3f} m", f"run {1e3 * spent:.0f} ms CPU a scan"]
+            info = [f"end to start {end:.3f} m", f"run {1e3 * spent:.0f} ms CPU a scan"]
             if "odometry" in log.streams:
                 truth = chain_odometry(log["odometry"]).poses
-                said += [f"ATE {ate(paths[name], truth):.3f} m", exits(run.submaps, times, truth)]
+                info += [f"ATE {ate(paths[name], truth):.3f} m", exits(run.submaps, times, truth)]
             lost = sum(m.report["scans_lost"] for m in run.submaps)
-            print(f"{pack:20s}{name:16s}{len(run.submaps):4d} submaps, {lost} scans lost;", "; ".join(said), flush=True)
+            print(f"{pack:20s}{name:16s}{len(run.submaps):4d} submaps, {lost} scans lost;", "; ".join(info), flush=True)
         print(f"{pack:20s}distance of the two paths {ate(*(paths[n] for n in NAMES)):.3f} m")
 
 
@@ -89,11 +89,11 @@ def simulated(draws: int, first: int, seconds: float, points: int, rate: float |
         truth = log.truth.trajectory.interpolate(log["clouds"].times)
         for name in NAMES:
             odometry = KissIcpOdometry(KissIcpConfig()) if name == "kiss-icp" else None
-            path, nees, said = followed(log["clouds"], truth, 10**9, odometry=odometry)
+            path, nees, info = followed(log["clouds"], truth, 10**9, odometry=odometry)
             rows[name].append(ate(path, truth))
             every[name] += nees
             carried = "hand" if config.sway else "wheels"
-            print(f"{world:9s}{seed:4d} {config.pattern:9s}{carried:7s}{name:15s} ATE {rows[name][-1]:.3f} m {said}")
+            print(f"{world:9s}{seed:4d} {config.pattern:9s}{carried:7s}{name:15s} ATE {rows[name][-1]:.3f} m {info}")
     for name, nees in every.items():
         a = rows[name]
         print(f"{points} points: {name:15s} ATE mean {np.mean(a):.3f}, median {np.median(a):.3f} m; ", end="")

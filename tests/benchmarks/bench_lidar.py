@@ -71,11 +71,11 @@ def followed(
     rate = float(np.median(np.diff(clouds.times)))
     cpu = spent / max(len(path) - 5, 1)
     bad = {s: n for s, n in states.items() if s not in ("first", "matched")}
-    said = f"{len(path):5d} scans {odometry.length:6.1f} m  {1e3 * cpu:6.1f} ms a scan ({rate / cpu:4.1f} × real time)"
+    line = f"{len(path):5d} scans {odometry.length:6.1f} m  {1e3 * cpu:6.1f} ms a scan ({rate / cpu:4.1f} × real time)"
     if nees:
         inside = np.mean(np.array(nees) < 12.6 / 6.0)
-        said += f"  NEES/6 {np.mean(nees):5.2f} (median {np.median(nees):4.2f}, {inside:.0%} inside 95 %)"
-    return path, nees, said + (f"  {bad}" if bad else "")
+        line += f"  NEES/6 {np.mean(nees):5.2f} (median {np.median(nees):4.2f}, {inside:.0%} inside 95 %)"
+    return path, nees, line + (f"  {bad}" if bad else "")
 
 
 def ate(path: Array, truth: Array) -> float:
@@ -94,7 +94,7 @@ def recorded(scans: int) -> None:
             continue
         clouds = log["clouds"]
         truth = chain_odometry(log["odometry"]).poses if "odometry" in log.streams else None
-        path, _, said = followed(clouds, truth, scans)
+        path, _, line = followed(clouds, truth, scans)
         errors = []
         if truth is not None:
             errors.append(f"odometry's {ate(path, truth[: len(path)]):.3f}")
@@ -102,7 +102,7 @@ def recorded(scans: int) -> None:
             errors.append(f"reference {ate(path, log['reference'].poses[: len(path)]):.3f}")
         if truth is None:
             errors.append("no reference (bench_kiss_icp: to KISS-ICP)")
-        print(f"{name:20s} ATE [m] {', '.join(errors)}  end to start {np.linalg.norm(path[-1, :3]):.3f} m\n   {said}")
+        print(f"{name:20s} ATE [m] {', '.join(errors)}  end to start {np.linalg.norm(path[-1, :3]):.3f} m\n   {line}")
 
 
 def simulated(draws: int, first: int, seconds: float) -> None:
@@ -117,7 +117,7 @@ def simulated(draws: int, first: int, seconds: float) -> None:
         truth = log.truth.trajectory.interpolate(log["clouds"].times)
         carried = "hand" if config.sway else "wheels"
         for what, imu in (("alone", None), ("IMU", log["imu"])):
-            path, nees, said = followed(log["clouds"], truth, 10**9, imu)
+            path, nees, line = followed(log["clouds"], truth, 10**9, imu)
             every.setdefault(what, []).extend(nees)
             off = se3.se3_log(
                 se3.se3_between(se3.se3_between(path[:-1], path[1:]), se3.se3_between(truth[:-1], truth[1:]))
@@ -126,7 +126,7 @@ def simulated(draws: int, first: int, seconds: float) -> None:
             rows.setdefault(what, []).append((ate(path, truth), *step))
             print(
                 f"{world:9s}{seed:5d} {config.pattern:9s}{carried:7s}{what:6s} ATE {rows[what][-1][0]:.4f} m "
-                f"scan to scan {1e3 * step[0]:.1f} mm, {1e3 * step[1]:.2f} mrad {said}"
+                f"scan to scan {1e3 * step[0]:.1f} mm, {1e3 * step[1]:.2f} mrad {line}"
             )
     for what, nees in every.items():
         a, mm, mrad = np.array(rows[what]).mean(axis=0)
@@ -172,8 +172,8 @@ def runs(draws: int, first: int, seconds: float) -> None:
                 value.get("consistency_imu_chi2_per_dof", np.nan),
             )
             table.setdefault(what, []).append(tuple(float(x) for x in row))
-            said = "aligned {:.4f} m, first base held {:.4f} m, up off {:.1f} mrad, NEES/n {:.2f}, ways {:.2f}"
-            print(f"{world:9s}{seed:5d} {what:15s}", said.format(*table[what][-1]), flush=True)
+            form = "aligned {:.4f} m, first base held {:.4f} m, up off {:.1f} mrad, NEES/n {:.2f}, ways {:.2f}"
+            print(f"{world:9s}{seed:5d} {what:15s}", form.format(*table[what][-1]), flush=True)
     for what, rows in table.items():
         mean, middle = np.mean(rows, axis=0), np.median(rows, axis=0)
         print(f"{what:15s} mean {np.array2string(mean, precision=4)}, middle {np.array2string(middle, precision=4)}")
@@ -207,8 +207,8 @@ def neighbours(scans: int) -> None:
             begin = time.perf_counter()
             ask(asked)
             figures[what] = 1e9 * (time.perf_counter() - begin) / len(query)
-        told = ", ".join(f"{what} {value:.0f}" for what, value in figures.items())
-        print(f"{name}: {len(centres)} cells, {len(query)} points, ns a point: {told}")
+        times = ", ".join(f"{what} {value:.0f}" for what, value in figures.items())
+        print(f"{name}: {len(centres)} cells, {len(query)} points, ns a point: {times}")
         print(f"   warm against cKDTree {figures['cKDTree'] / figures['warm']:.1f} ×")
 
 

@@ -130,8 +130,8 @@ def wrong_table(chain: ChainRelativePoses, loops: list[Loop], truth: Array, seed
                 rng = SeedTree(seed).child("wrong", kind).generator()
                 mixed, wrong = inject_wrong_loops(loops, truth, share, rng, kind=kind)
                 net, closer = closed(chain, mixed, map_check)
-                taken = np.isin(np.arange(len(mixed)), closer.accepted)
-                np.add.at(counts, (wrong.astype(int), taken.astype(int)), 1)
+                accepted = np.isin(np.arange(len(mixed)), closer.accepted)
+                np.add.at(counts, (wrong.astype(int), accepted.astype(int)), 1)
                 ratios.append(ate(net.poses[: len(truth)], truth) / clean)
             precision = counts[0, 1] / max(counts[:, 1].sum(), 1)
             print(
@@ -189,10 +189,10 @@ def main() -> None:
         e = np.array([error_of(x, truth) for x in right]).reshape(-1, 6)
         own = [v @ np.linalg.solve(x.covariance, v) / 6 for v, x in zip(e, right)]
         net, closer = closed(chain, loops, measurer.contradictions)
-        taken = [is_right(closer.loops[n], truth) for n in closer.accepted]
+        accepted = [is_right(closer.loops[n], truth) for n in closer.accepted]
         print(
             f"{name}: {len(places)} places, {len(submaps)} submaps, {len(candidates)} candidates; accepted by the "
-            f"gates {len(loops)}, right {len(right)}; taken {len(taken)}, right {sum(taken)}; "
+            f"gates {len(loops)}, right {len(right)}; taken {len(accepted)}, right {sum(accepted)}; "
             f"{matched - begin:.1f} s to match, {time.perf_counter() - matched:.1f} s to decide"
         )
         if len(e):

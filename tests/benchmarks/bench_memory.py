@@ -129,8 +129,8 @@ def main() -> None:
             drive(source, 60.0 if a.quick else a.length, a.seed)
         peaks = Peaks()
         print(f"{'':26s} {'before':>8s} {'after':>8s} {'peak MB':>8s} {'CPU s':>9s}")
-        for place, name, said in STAGES:
-            setattr(place, name, peaks.watched(getattr(place, name), said))
+        for place, name, stage in STAGES:
+            setattr(place, name, peaks.watched(getattr(place, name), stage))
         begin()
         start = time.process_time()
         run = gs.run(source, frontend=a.frontend, out=Path(folder) / "run", config=config, progress=False)

@@ -83,7 +83,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
     history = [(h.seconds, h.objective, h.chi2, h.products, h.predicted, h.largest_move) for h in found.history]
     end = found.chi2
     within = next(h[0] for h in history if h[2] <= 1.01 * end)
-    settled = next((h[0] for h in history if h[4] < 1.0), None)
+    converged = next((h[0] for h in history if h[4] < 1.0), None)
     reckoned, truth = problem.dead_reckoning(), world.truth
     top = peak()
 
@@ -115,7 +115,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
         "wall": wall,
         "stages": found.seconds,
         "within": within,
-        "settled": settled,
+        "settled": converged,
         "history": history,
         "converged": found.converged,
         "objective": found.objective,

@@ -153,10 +153,10 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
 def describe(result: SegSlamResult) -> str:
     """How the run segmented and matched."""
     r = result.report()
-    taken = sum(a.matched > 0 for a in result.attempts)
+    matched = sum(a.matched > 0 for a in result.attempts)
     return (
         f"{r['steps']} steps, {r['path_length']:.0f} m, {r['particles']} particles; {r['intervals']} intervals, "
-        f"{r['segments']} segments; {len(result.attempts)} attempts with candidates, {taken} with a match; "
+        f"{r['segments']} segments; {len(result.attempts)} attempts with candidates, {matched} with a match; "
         f"N_eff/N {r['effective_median']:.2f} (5 %: {r['effective_p05']:.2f}); maps {r['maps_megabytes']:.0f} MB"
     )
 

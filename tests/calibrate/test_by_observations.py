@@ -84,14 +84,14 @@ def test_withheld_observations_take_what_is_right_and_refuse_what_is_wrong(log, 
     scans = window_scans(seen, LONG)
     bent = dataclasses.replace(found.corrections.without_constants(), yaw_bias=0.2)
     blunt = dataclasses.replace(bent, range_sigma=1e5, bearing_sigma=1e4)
-    for c, taken in ((bent, "noise"), (blunt, "nothing")):
+    for c, supported in ((bent, "noise"), (blunt, "nothing")):
         wrong = found.validated(
             predict_withheld_observations(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise())
         )
-        assert wrong.prediction.supported == taken
+        assert wrong.prediction.supported == supported
         assert not any(e.applied for e in wrong.estimates)
         assert "calibration-refused" in {f.code for f in wrong.findings()}
-        assert wrong.corrections == (found.corrections.without_constants() if taken == "noise" else Corrections())
+        assert wrong.corrections == (found.corrections.without_constants() if supported == "noise" else Corrections())
 
 
 def test_corrections_that_change_nothing_predict_nothing_better(log, found) -> None:
@@ -139,8 +139,8 @@ def test_run_of_an_unknown_log_is_calibrated_and_says_so(log, tmp_path) -> None:
     run = gs.run(log, config=OPTIONS, progress=False, out=tmp_path / "run")
     assert run.metric("nees_aligned_poses_per_dof") < 0.1 * stated.metric("nees_aligned_poses_per_dof")
     assert run.metric("path_rmse_aligned") < stated.metric("path_rmse_aligned")
-    said = [f.text for f in run.verdict if f.code == "calibrated"]
-    assert any("odometry stamps" in s for s in said)
+    texts = [f.text for f in run.verdict if f.code == "calibrated"]
+    assert any("odometry stamps" in s for s in texts)
     given = read_toml(tmp_path / "run" / "config.toml")["calibrate"]["given"]
     assert given["clock"] == pytest.approx(ROBOT.clock, abs=0.05)
     before = (tmp_path / "run" / "config.toml").read_bytes()
@@ -196,9 +196,9 @@ def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> No
 
 def test_a_scale_that_is_hardly_observable_is_left() -> None:
     """On a robot of MRCLAM wheels looked half as long as they are, ± 20 %, and the map came out 300 m wide."""
-    sure = Estimate(name="distance_scale", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
-    vague = dataclasses.replace(sure, value=0.68, sigma=0.2, gain=3783.0, other=0.7, other_sigma=0.2)
-    assert sure.gated().applied
+    clear = Estimate(name="distance_scale", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
+    vague = dataclasses.replace(clear, value=0.68, sigma=0.2, gain=3783.0, other=0.7, other_sigma=0.2)
+    assert clear.gated().applied
     assert not vague.gated().applied
     assert "20 %" in vague.gated().why_not
     assert not vague.contradiction

@@ -69,9 +69,9 @@ def test_coordinates_distances_and_names():
 def test_rows_are_refused_by_line(row, why):
     found = parsed("good,0.5,,,1,2,,,,0.1", row)
     assert [r.line for r in found.rows] == [2]
-    ((line, said),) = found.refused
+    ((line, reason),) = found.refused
     assert line == 3
-    assert why in said
+    assert why in reason
 
 
 def test_rows_that_contradict_are_both_refused():

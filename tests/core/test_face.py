@@ -33,13 +33,13 @@ def shown() -> str:
 @every_room
 def test_every_name_of_a_face_is_there_and_says_what_it_is(room: str) -> None:
     module = importlib.import_module(f"graphslam.{room}")
-    taken = {m.name for m in pkgutil.iter_modules(module.__path__)}
+    modules = {m.name for m in pkgutil.iter_modules(module.__path__)}
     for name in module.__all__:
         thing = getattr(module, name)
-        assert name not in taken, f"{room}.{name} is a module, too: importing it would take the name's place"
+        assert name not in modules, f"{room}.{name} is a module, too: importing it would take the name's place"
         if callable(thing):
-            said = inspect.getdoc(thing) or ""
-            assert re.match(r"\S.*[.:]", said), f"{room}.{name} has no docstring"
+            doc = inspect.getdoc(thing) or ""
+            assert re.match(r"\S.*[.:]", doc), f"{room}.{name} has no docstring"
     assert set(module.__all__) <= set(dir(module))
 
 

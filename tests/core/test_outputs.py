@@ -155,8 +155,8 @@ def test_a_list_of_files_from_somebody_else_deletes_nothing_outside(name: str, t
     (tmp_path / "mine.txt").write_text("mine")
     home = made(tmp_path / "out", "index")
     (home / "link").symlink_to(tmp_path)
-    said = json.loads((home / LISTED).read_text())
-    (home / LISTED).write_text(json.dumps({**said, "files": [name]}))
+    listed = json.loads((home / LISTED).read_text())
+    (home / LISTED).write_text(json.dumps({**listed, "files": [name]}))
     with pytest.raises(FormatError, match="leads out of its folder"):
         made(home, "index")
     assert (tmp_path / "mine.txt").read_text() == "mine"

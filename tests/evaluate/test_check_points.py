@@ -112,10 +112,10 @@ def test_power_is_exact():
 
 def test_power_is_that_of_the_map_and_not_of_the_rows():
     g, chain, rng = world(2, True)
-    sure, vague = (check_points(g, table(check_rows(chain, rng, s))) for s in (1e-3, 1.0))
-    assert sure.dof == vague.dof
-    assert sure.power > 0.6 > 0.06 > vague.power
-    assert power_of_test(np.full(int(sure.dof), 2.0)) == pytest.approx(sure.power, abs=0.02)
+    exact, vague = (check_points(g, table(check_rows(chain, rng, s))) for s in (1e-3, 1.0))
+    assert exact.dof == vague.dof
+    assert exact.power > 0.6 > 0.06 > vague.power
+    assert power_of_test(np.full(int(exact.dof), 2.0)) == pytest.approx(exact.power, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,8 @@ def test_an_error_is_measured(log: SensorLog, frontend: str, fault: inject.Injec
     best = float(found.reduction.max())
     assert found.reduction[k] > 0.95 * best  # scales of ranges and of distances take away the same: one cannot be told
     lines = {f.code: f for f in bias_test_findings(reports(fault(log), frontend))}
-    said = KINDS[name].more if truth > 0 else KINDS[name].less
-    assert said.partition("{}")[2] in lines["calibration"].text
+    text = KINDS[name].more if truth > 0 else KINDS[name].less
+    assert text.partition("{}")[2] in lines["calibration"].text
 
 
 @pytest.mark.parametrize("seed", range(40, 46))

@@ -57,14 +57,14 @@ def test_what_the_fit_makes_of_white_noise_is_not_called_correlated(rng):
     rough = np.cos(np.pi * np.outer(t + 0.5, np.arange(50, n)) / n)  # what is left is smooth
     B = np.linalg.qr(rough)[0]
     C = np.eye(n) - B @ B.T
-    told, naive = [], []
+    scores, naive = [], []
     for _ in range(300):
         r = (C @ rng.standard_normal(n))[:, None]
-        told.append(residual_whiteness(t, r, C.reshape(n, 1, n, 1)).score)
+        scores.append(residual_whiteness(t, r, C.reshape(n, 1, n, 1)).score)
         naive.append(residual_whiteness(t, r).score)
     # scaled by the size that was found: the mean is right to a tenth of σ
-    assert abs(np.mean(told)) < 0.15
-    assert 0.8 < np.std(told) < 1.2
+    assert abs(np.mean(scores)) < 0.15
+    assert 0.8 < np.std(scores) < 1.2
     assert np.mean(naive) > 2.0
 
 

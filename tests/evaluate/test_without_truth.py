@@ -233,13 +233,13 @@ def test_correlation_between_fixes_is_seen_where_their_size_is_right():
     assert rows.loc["each", "autocorrelation"] > 10 * rows.loc["each", "white"] / 1.96
     # told of the correlation, the joint test is satisfied with the very same errors plus white ones
     model = np.kron(np.kron(np.eye(n // 20), np.ones((20, 20))), np.eye(2)) + 0.01 * np.eye(2 * n)
-    told = GpsInnovations(
+    joint = GpsInnovations(
         times=g.times,
         innovations=correlated + 0.1 * generator.standard_normal((n, 2)),
         covariance=model,
         unpredicted=0,
     )
-    rows = told.tests().set_index("test")
+    rows = joint.tests().set_index("test")
     assert rows.loc["joint", "verdict"] == "consistent"
     assert abs(rows.loc["joint", "autocorrelation"]) < 3 * rows.loc["joint", "white"] / 1.96
     assert rows.loc["each", "dof"] < 30 < rows.loc["joint", "dof"]

@@ -193,13 +193,13 @@ def test_a_failed_write_leaves_the_old_file(rng: np.random.Generator, tmp_path: 
 def test_map_server_pair_says_what_the_grid_says(rng: np.random.Generator, tmp_path: Path) -> None:
     grid = scanned_grid(rng, dim=2)
     yaml, image = save_map_server(grid, tmp_path / "floor's plan.yaml")
-    cell, said = read_map_server(yaml)
-    assert said["image"] == "floor's plan.pgm"
+    cell, info = read_map_server(yaml)
+    assert info["image"] == "floor's plan.pgm"
     assert image.name == "floor's plan.pgm"
     assert image.read_bytes().startswith(b"P5\n%d %d\n255\n" % cell.shape[::-1])
-    assert said["mode"] == "trinary"
-    assert said["origin"][2] == 0.0
-    low, step = np.array(said["origin"][:2]), said["resolution"]
+    assert info["mode"] == "trinary"
+    assert info["origin"][2] == 0.0
+    low, step = np.array(info["origin"][:2]), info["resolution"]
     rows, columns = np.indices(cell.shape)
     points = np.stack([low[0] + (columns + 0.5) * step, low[1] + (rows + 0.5) * step], axis=-1)
     values = grid.values_at(points.reshape(-1, 2)).reshape(cell.shape)
@@ -243,7 +243,7 @@ print(freed)
 
 
 def test_kernels_do_the_same_uncompiled(tmp_path: Path) -> None:
-    said = []
+    outputs = []
     for flag in ("0", "1"):
         folder = tmp_path / flag
         folder.mkdir()
@@ -256,7 +256,7 @@ def test_kernels_do_the_same_uncompiled(tmp_path: Path) -> None:
         )
         assert run.returncode == 0, run.stderr
         assert "Warning" not in run.stderr
-        said.append((run.stdout, {p.name: p.read_bytes() for p in folder.iterdir()}))
-    assert said[0] == said[1]
-    assert len(said[0][1]) == 7
-    assert "bricks=15" in said[0][0]  # of sixteen equal ones
+        outputs.append((run.stdout, {p.name: p.read_bytes() for p in folder.iterdir()}))
+    assert outputs[0] == outputs[1]
+    assert len(outputs[0][1]) == 7
+    assert "bricks=15" in outputs[0][0]  # of sixteen equal ones

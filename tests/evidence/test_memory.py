@@ -45,16 +45,16 @@ def test_private_memory_is_what_a_release_frees(rng: np.random.Generator, compac
         if compacted:
             compact_grids(grids)
         chosen = [grids[k] for k in rng.choice(len(grids), rng.integers(1, 8), replace=False)]
-        told = measure_memory(chosen)
-        assert (told.nodes, told.bricks) == reached(chosen)
-        assert told.total == told.nodes * NODE_BYTES + told.bricks * BRICK_BYTES
-        assert told.shared == told.total - told.private >= 0
+        memory = measure_memory(chosen)
+        assert (memory.nodes, memory.bricks) == reached(chosen)
+        assert memory.total == memory.nodes * NODE_BYTES + memory.bricks * BRICK_BYTES
+        assert memory.shared == memory.total - memory.private >= 0
         nodes, bricks = pool.used_nodes, pool.used_bricks
         for g in chosen:
             g.release()
-        assert (told.private_nodes, told.private_bricks) == (nodes - pool.used_nodes, bricks - pool.used_bricks)
-        some_private += told.private > 0
-        some_shared += told.shared > 0
+        assert (memory.private_nodes, memory.private_bricks) == (nodes - pool.used_nodes, bricks - pool.used_bricks)
+        some_private += memory.private > 0
+        some_shared += memory.shared > 0
     assert some_private > 2
     assert some_shared > 2
 
@@ -76,9 +76,9 @@ def test_a_copy_costs_nothing_and_a_write_what_it_changes(rng: np.random.Generat
 
 def test_everything_together_is_the_pool(rng: np.random.Generator) -> None:
     grids = family(rng)
-    told = measure_memory(grids)
-    assert told.private == told.total == grids[0].pool.used_bytes
-    assert sum(g.memory().private for g in grids) < told.total < sum(g.memory().total for g in grids)
+    memory = measure_memory(grids)
+    assert memory.private == memory.total == grids[0].pool.used_bytes
+    assert sum(g.memory().private for g in grids) < memory.total < sum(g.memory().total for g in grids)
 
 
 def test_nothing_and_strangers() -> None:

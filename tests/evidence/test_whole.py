@@ -165,9 +165,9 @@ def test_grids_that_do_not_belong_together_are_refused_whole(world: World) -> No
     g = world.grids
     stranger = EvidenceGrid(VOXEL)
     finer = EvidenceGrid(VOXEL / 2, pool=world.pool)
-    surer = EvidenceGrid(VOXEL, pool=world.pool, model=BeamModel(hit=0.9))
+    other_model = EvidenceGrid(VOXEL, pool=world.pool, model=BeamModel(hit=0.9))
     flat = EvidenceGrid(VOXEL, pool=world.pool, dim=2)
-    for other in (stranger, finer, surer, flat, g[0]):
+    for other in (stranger, finer, other_model, flat, g[0]):
         with pytest.raises(GridError):
             update_grids([g[0], g[1], other], world.poses, world.scan)
     for poses in (world.poses[:2], np.tile(world.poses, (2, 1))):

@@ -261,19 +261,19 @@ def _lose(lost: str) -> None:
 
 
 def _heard(child: int, streams: list[int], begin: float, lost: str) -> Ended:
-    said = dict.fromkeys(streams, b"")
+    received = dict.fromkeys(streams, b"")
     waiting = set(streams)
     while waiting and time.monotonic() < begin + PATIENCE:
         for s in select.select(list(waiting), [], [], 1.0)[0]:
             part = os.read(s, 65536)
-            said[s] += part
+            received[s] += part
             if not part:
                 waiting.discard(s)
     late = bool(waiting)
     if late:
         os.killpg(child, signal.SIGKILL)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    texts = [said[s].decode(errors="replace") for s in streams]
+    texts = [received[s].decode(errors="replace") for s in streams]
     for s in streams:
         os.close(s)
     if len(texts) == 1:
@@ -361,13 +361,13 @@ class Bench:
         states = [old, new] if verb.same else None
         for condition, cases in _CONDITIONS.items():
             if condition in conditions:
-                said = ""
-                for said, made, codes, allowed in cases(self, verb, asked, operations, states):
+                case = ""
+                for case, made, codes, allowed in cases(self, verb, asked, operations, states):
                     self.fresh()
-                    self.check(f"{condition}, {said}", name, made(), codes, allowed)
+                    self.check(f"{condition}, {case}", name, made(), codes, allowed)
                 again = condition in AGAIN and verb.same and name not in ("merge", "loops --undo")
-                if said and again:
-                    self.check(f"{condition}, again after {said}", name, copied(asked), {0}, [new])
+                if case and again:
+                    self.check(f"{condition}, again after {case}", name, copied(asked), {0}, [new])
         print(f"{name}: {operations} operations, {time.monotonic() - begin:.0f} s", flush=True)
 
 

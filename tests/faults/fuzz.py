@@ -163,14 +163,14 @@ def run_reader(name: str, cases: int, seed: int) -> tuple[Counter[str], list[tup
                     line = process.stdout.readline() if waiting else ""
                     if not line:
                         break
-                    said = json.loads(line)
+                    message = json.loads(line)
                     ready = True
-                    if said == ["ready"]:
+                    if message == ["ready"]:
                         continue
-                    k = said[0] + 1
-                    counts[said[1]] += 1
-                    if said[1] in BAD:
-                        bad.append((said[0], said[1], said[2], said[3]))
+                    k = message[0] + 1
+                    counts[message[1]] += 1
+                    if message[1] in BAD:
+                        bad.append((message[0], message[1], message[2], message[3]))
                 if k < cases:
                     hung = process.poll() is None and not waiting
                     process.kill()
@@ -210,11 +210,11 @@ def main() -> None:
         counts, bad = run_reader(name, a.cases, a.seed)
         print(f"{name:16}{sum(counts.values()):>8}" + "".join(f"{counts[k]:>12}" for k in KINDS), flush=True)
         seen: Counter[str] = Counter()
-        for k, kind, done, said in bad:
-            last = said.strip().split("\n")[-1]
+        for k, kind, done, text in bad:
+            last = text.strip().split("\n")[-1]
             seen[kind + last[:60]] += 1
             if seen[kind + last[:60]] <= 2:
-                indented = said.strip().replace("\n", "\n        ")
+                indented = text.strip().replace("\n", "\n        ")
                 print(f"    case {k}: {kind}: {done}\n        {indented}", flush=True)
         failed |= bool(bad)
     sys.exit(1 if failed else 0)

@@ -48,14 +48,14 @@ class Seen:
         bound = float(chi2.ppf(0.999, self.dof)) / self.dof
         return self.exits > bound or (self.nodes > bound and self.heading < 0.2)
 
-    def said(self, level: tuple[str, ...] = ("bad", "look")) -> set[str]:
+    def codes(self, level: tuple[str, ...] = ("bad", "look")) -> set[str]:
         """Codes of the lines that ask the user to look."""
         return {f.code for f in self.lines if f.level in level}
 
     def silently_wrong(self, clean: Seen) -> bool:
         """Overconfident, worse than without the fault, and no line that the clean run does not have."""
         worse = self.error > ERROR_MARGIN[0] * clean.error + ERROR_MARGIN[1]
-        return not self.refused and self.confident and worse and not self.said() - clean.said()
+        return not self.refused and self.confident and worse and not self.codes() - clean.codes()
 
 
 def score(run: Run, log: SensorLog) -> dict[str, float]:

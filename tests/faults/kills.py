@@ -236,11 +236,11 @@ def forked(arguments: list[str], out: Path, kill_before: int | None = None) -> t
             os._exit(code)
     os.close(write)
     with os.fdopen(read) as stream:
-        said = stream.read()
+        text = stream.read()
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code > 0:
-        raise RuntimeError(f"{' '.join(arguments)}: {said}")
-    return code, int(said) if code == 0 else 0
+        raise RuntimeError(f"{' '.join(arguments)}: {text}")
+    return code, int(text) if code == 0 else 0
 
 
 def executed(arguments: list[str], kill_after: float | None = None) -> tuple[int, float]:
@@ -433,8 +433,8 @@ class Bench:
         edges = np.linspace(1, self.operations + 1, count - timed + 1)
         for a, b in pairwise(edges):
             k = int(rng.integers(int(a), max(int(b), int(a) + 1)))
-            said = f"before operation {k} of {self.operations}"
-            self.kill(partial(self.before, k), said, tally)
+            moment = f"before operation {k} of {self.operations}"
+            self.kill(partial(self.before, k), moment, tally)
         return tally
 
 

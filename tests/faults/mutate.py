@@ -286,7 +286,7 @@ def damage_file(rng: Rng, path: Path) -> str:
 def damage(rng: Rng, root: Path) -> str:
     """Damage a file of a folder, once or twice; or make files missing, empty, links, folders or each other."""
     files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.is_file())
-    said = []
+    damages = []
     for _ in range(1 if rng.random() < 0.8 else 2):
         files = [f for f in files if f.is_file()]
         if not files:
@@ -294,7 +294,7 @@ def damage(rng: Rng, root: Path) -> str:
         path = pick(rng, files)
         kind = rng.random()
         if kind < 0.9:
-            said.append(damage_file(rng, path))
+            damages.append(damage_file(rng, path))
             continue
         if kind < 0.92:
             path.unlink()
@@ -308,5 +308,5 @@ def damage(rng: Rng, root: Path) -> str:
         else:
             path.unlink()
             path.symlink_to(pick(rng, ("/etc/hostname", path.name, "nowhere")))
-        said.append(f"{path.name}: missing, empty, a folder, another file or a link ({kind:.3f})")
-    return "; ".join(said)
+        damages.append(f"{path.name}: missing, empty, a folder, another file or a link ({kind:.3f})")
+    return "; ".join(damages)

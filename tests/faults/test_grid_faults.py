@@ -37,7 +37,7 @@ def clean(dim: int, frontend: str) -> Seen:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_sound_log_is_not_reproached(dim: int, frontend: str) -> None:
     seen = clean(dim, frontend)
-    assert not seen.said(), seen.lines
+    assert not seen.codes(), seen.lines
     assert not seen.confident
     assert seen.error < 0.5
 
@@ -54,7 +54,7 @@ def test_every_fault_has_its_outcome(row: Row, dim: int, frontend: str) -> None:
         return
     assert not seen.refused
     if row.outcome == "reported":
-        assert seen.said() & set(row.sign.split("|")), seen.lines
+        assert seen.codes() & set(row.sign.split("|")), seen.lines
     elif row.outcome == "dropped":
         assert any(row.sign in reason and n > 0 for reason, n in seen.dropped.items()), seen.dropped
         assert not seen.confident

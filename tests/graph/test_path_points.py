@@ -156,10 +156,10 @@ def test_a_point_that_nobody_measures_changes_nothing(drive):
     log, submaps = drive
     gps = log["gps"]
     bare = [replace(s, landmarks=replace(s.landmarks, path=None)) for s in submaps]
-    told = solved(submaps, gps.with_sigma(1e5))
+    measured = solved(submaps, gps.with_sigma(1e5))
     plain = solved(bare, gps.with_sigma(1e5))
-    assert np.allclose(told.values.poses, plain.values.poses, atol=1e-6)
-    P, Q = (g.covariance().poses() for g in (told, plain))
+    assert np.allclose(measured.values.poses, plain.values.poses, atol=1e-6)
+    P, Q = (g.covariance().poses() for g in (measured, plain))
     assert np.allclose(P, Q, rtol=1e-5, atol=1e-12)
 
 
@@ -251,12 +251,12 @@ def test_points_leave_with_their_submap_and_follow_its_landmarks(drive):
     assert all(drop not in r.landmark_ids for r in paths)
     last = graph.submaps[-1]
     before = graph.values.count("point")
-    gone = len(last.inner_points.rows)
+    removed = len(last.inner_points.rows)
     graph.remove(last.factor_id)
-    assert graph.values.count("point") == before - gone > 0
+    assert graph.values.count("point") == before - removed > 0
     BatchSolver(graph).solve_to_optimum()
     held = [n for r in graph.records.values() for n in r.variables() if n.startswith("point")]
-    assert {int(n[5:]) for n in held} == set(range(before - gone))
+    assert {int(n[5:]) for n in held} == set(range(before - removed))
 
 
 def test_the_store_keeps_them_and_maps_without_them_are_read(drive):

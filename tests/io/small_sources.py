@@ -171,10 +171,10 @@ def kitti_odometry(root: Path, n: int = STEPS) -> Path:
 
 def kitti_raw(root: Path, n: int = STEPS) -> Path:
     """``velodyne_points/`` and ``oxts/`` with their stamps."""
-    said = [f"2011-09-26 13:02:{25 + PERIOD * k:012.9f}" for k in range(n)]
+    lines = [f"2011-09-26 13:02:{25 + PERIOD * k:012.9f}" for k in range(n)]
     for name in ("velodyne_points", "oxts"):
         (root / name / "data").mkdir(parents=True)
-        (root / name / "timestamps.txt").write_text("\n".join(said) + "\n")
+        (root / name / "timestamps.txt").write_text("\n".join(lines) + "\n")
     for k, (xyz, pose) in enumerate(zip(clouds(n), poses(n))):
         write_bin(root / "velodyne_points" / "data" / f"{k:010d}.bin", xyz)
         fix = [49.0 + pose[1] / 111_000.0, 8.4 + pose[0] / 73_000.0, 116.0 + pose[2]]

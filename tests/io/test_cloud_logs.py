@@ -176,9 +176,9 @@ def test_columns_of_bin_are_identified_by_content(tmp_path: Path, columns: int) 
         np.column_stack([xyz, more])[:, :columns].astype("<f4").tofile(tmp_path / f"{k}.bin")
     log = load_recording(tmp_path)
     np.testing.assert_allclose(log["clouds"].cloud(5), xyz, rtol=1e-6)
-    said = [n for n in log.meta["notes"] if "columns" in n]
-    assert bool(said) == (columns != 4)
-    assert all(f"of {columns} columns" in n for n in said)
+    notes = [n for n in log.meta["notes"] if "columns" in n]
+    assert bool(notes) == (columns != 4)
+    assert all(f"of {columns} columns" in n for n in notes)
 
 
 def test_bin_files_that_say_nothing_of_their_columns_are_those_of_kitti(tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ def test_a_bag_is_read_up_to_the_cut(tmp_path: Path, form: str, part: float) -> 
     log = load_recording(path.parent if form == "folder" else path)
     # a block of bzip2 holds 900 kB, of LZ4 64 kB, a chunk of MCAP here one cloud
     n = holds_the_first(log, int(part * N) - (30 if form == "ros1:BZ2" else 3), int(part * N) + 1)
-    said = bag_fault(log)
-    count, last = int(said.split("read up to there: ")[1].split()[0]), float(said.split("the last at ")[1])
+    fault = bag_fault(log)
+    count, last = int(fault.split("read up to there: ")[1].split()[0]), float(fault.split("the last at ")[1])
     assert count == len(log["imu"].times) + n
     assert last == pytest.approx(max(log["imu"].times[-1], T0 + 0.1 * (n - 1) + 0.02), abs=1e-3)
 

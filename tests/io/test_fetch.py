@@ -79,8 +79,8 @@ def test_fetch_checks_and_does_not_fetch_twice(
     assert folder == tmp_path / "cache/toy" == locate(c)
     assert [k.state for k in check_files(c)] == ["ok"] * 3
     assert (folder / "a.txt").read_bytes() == CONTENT
-    for said in ("licence: text", "cite: text", f"downloading {url}/b.bin", "fetching 3 of 3 files"):
-        assert said in caplog.text
+    for text in ("licence: text", "cite: text", f"downloading {url}/b.bin", "fetching 3 of 3 files"):
+        assert text in caplog.text
     assert sorted(Quiet.served) == ["/a.txt", "/b.bin", "/note.txt"]
     with caplog.at_level(logging.INFO):
         fetch_dataset(c)

@@ -252,8 +252,8 @@ def test_messages(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert case(tmp_path) is not None
         return
     try:
-        said = str(case(tmp_path))
+        message = str(case(tmp_path))
     except GraphSlamError as error:
-        said = str(error)
+        message = str(error)
     for words in wanted:
-        assert words in said
+        assert words in message

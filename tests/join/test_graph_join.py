@@ -211,8 +211,8 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
         (lambda: JoinProblem.of_graph(FactorGraph(3)), DataError, "no submaps"),
         (lambda: two_sessions(submaps), DataError, "one chain"),
     ]
-    for call, kind, said in refused:
-        with pytest.raises(kind, match=said) as error:
+    for call, kind, message in refused:
+        with pytest.raises(kind, match=message) as error:
             call()
         assert "\n" not in str(error.value)
     large, _ = pose_ramp(1, dim=3, submaps=2, steps=MOST_STATES // 12 + 1, loops=0)

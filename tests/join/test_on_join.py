@@ -44,16 +44,16 @@ def test_the_view_after_submap_k_is_the_join_of_the_first_k(join, chain: list[Su
 
 
 def test_both_forms_tell_the_same_at_every_submap(chain: list[Submap]) -> None:
-    told: dict[str, list[np.ndarray]] = {"eif": [], "ekf": []}
+    estimates: dict[str, list[np.ndarray]] = {"eif": [], "ekf": []}
     for name, join in (("eif", join_sequential), ("ekf", join_ekf)):
 
         def on_join(k: int, view: JoinedMapView, name: str = name) -> None:
-            told[name].append(
+            estimates[name].append(
                 np.concatenate([view.pose(), view.pose_covariance().ravel(), view.landmark_marginals().ravel()])
             )
 
         join(chain, on_join=on_join)
-    for a, b in zip(told["eif"], told["ekf"], strict=True):
+    for a, b in zip(estimates["eif"], estimates["ekf"], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-10)
 
 

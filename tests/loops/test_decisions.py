@@ -30,13 +30,13 @@ def closer_of(poses: Array, seed: int = 0, config: LoopConfig | None = None) -> 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_right_loops_are_taken_and_mend_the_chain(dim: int) -> None:
     poses = square_poses(dim)
-    errors, taken = [], 0
+    errors, accepted = [], 0
     for seed in range(8):
         closer, net = closer_of(poses, seed)
         before = np.linalg.norm((net.poses - poses)[:, :dim], axis=1).mean()
         decisions = closer.propose(right_loops(poses, np.random.default_rng(100 + seed)))
         errors.append([before, np.linalg.norm((net.poses - poses)[:, :dim], axis=1).mean()])
-        taken += sum(d.verdict == "accepted" for d in decisions)
+        accepted += sum(d.verdict == "accepted" for d in decisions)
         for d in decisions:
             if d.verdict == "accepted":
                 assert 0.5 < d.weight <= 1.0
@@ -44,7 +44,7 @@ def test_right_loops_are_taken_and_mend_the_chain(dim: int) -> None:
                 # the first is predicted exactly to first order; with a kernel the objective rises by no more
                 assert d.effect == pytest.approx(d.effect_predicted, rel=0.25, abs=0.5)
                 assert d.effect_earlier <= d.effect + 1e-6
-    assert taken >= 44  # of 48
+    assert accepted >= 44  # of 48
     mean = np.mean(errors, axis=0)
     assert mean[1] < 0.8 * mean[0]
 
@@ -53,20 +53,20 @@ def test_right_loops_are_taken_and_mend_the_chain(dim: int) -> None:
 @pytest.mark.parametrize("share", [0.3, 0.5])
 def test_wrong_loops_are_kept_out(kind: Kind, share: float) -> None:
     poses = square_poses(3)
-    wrong_taken, right_taken, right_all = 0, 0, 0
+    wrong_accepted, right_accepted, right_all = 0, 0, 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
         closer, net = closer_of(poses, seed)
         loops, wrong = inject_wrong_loops(right_loops(poses, rng, 8), poses, share, rng, kind=kind, period=4.0)
         assert wrong.mean() == pytest.approx(share, abs=0.08)
-        taken = np.array([d.verdict == "accepted" for d in closer.propose(loops)])
-        wrong_taken += int(np.sum(taken & wrong))
-        right_taken, right_all = right_taken + int(np.sum(taken & ~wrong)), right_all + int(np.sum(~wrong))
+        accepted = np.array([d.verdict == "accepted" for d in closer.propose(loops)])
+        wrong_accepted += int(np.sum(accepted & wrong))
+        right_accepted, right_all = right_accepted + int(np.sum(accepted & ~wrong)), right_all + int(np.sum(~wrong))
         assert np.linalg.norm((net.poses - poses)[:, :3], axis=1).max() < 1.0
         for d in closer.ledger.current():
             assert d.verdict == "accepted" or d.why
-    assert wrong_taken == 0
-    assert right_taken >= 0.9 * right_all
+    assert wrong_accepted == 0
+    assert right_accepted >= 0.9 * right_all
 
 
 def test_a_wrong_loop_that_came_first_is_switched_off_when_the_right_ones_come() -> None:
@@ -127,7 +127,7 @@ def test_the_graph_without_a_loop_is_what_it_is_without_it(dim: int) -> None:
     closer, _ = closer_of(poses, 1, LoopConfig(kernel=0.999999, level=0.99999, pairwise=0.9999))
     closer.propose(loops)
     assert len(closer.accepted) == 4
-    said = closer.without(closer.accepted)
+    chi2 = closer.without(closer.accepted)
     for k in range(4):
         other, _ = closer_of(poses, 1, LoopConfig(kernel=0.999999, level=0.99999, pairwise=0.9999))
         other.propose([x for m, x in enumerate(loops) if m != k])
@@ -136,7 +136,7 @@ def test_the_graph_without_a_loop_is_what_it_is_without_it(dim: int) -> None:
         D = g.between(T[0], loops[k].T_ij)
         e, A = g.log(D), g.adjoint(D)
         wanted = float(e @ np.linalg.solve(P[0] + A @ loops[k].covariance @ A.T, e))
-        assert said[k] == pytest.approx(wanted, rel=0.1, abs=0.1)
+        assert chi2[k] == pytest.approx(wanted, rel=0.1, abs=0.1)
 
 
 def test_chi2_of_a_right_loop_is_that_of_its_degrees_of_freedom() -> None:

@@ -75,13 +75,13 @@ def test_it_is_the_chain_by_itself(dim: int) -> None:
         *(loop_of(every, a, a + 16, np.random.default_rng(a)) for a in (0, 2, 4, 6)),
         loop_of(every, 1, 9, rng, np.concatenate([np.zeros(group_of(poses).dof - 2), [3.0, 2.0]])),
     ]
-    said = []
+    decisions = []
     for graph in (ours, plain):
         closer = LoopCloser(graph, T, P)
         closer.propose(loops)
-        said.append([(d.verdict, f"{d.chi2:.2f}", f"{d.effect:.1f}") for d in closer.ledger.current()])
-    assert said[0] == said[1]
-    assert [v for v, *_ in said[0]] == ["accepted"] * 4 + ["rejected"]
+        decisions.append([(d.verdict, f"{d.chi2:.2f}", f"{d.effect:.1f}") for d in closer.ledger.current()])
+    assert decisions[0] == decisions[1]
+    assert [v for v, *_ in decisions[0]] == ["accepted"] * 4 + ["rejected"]
     np.testing.assert_allclose(ours.graph.values.poses, plain.poses, atol=1e-4)
     assert ours.graph.objective()[GROUP].factors == 4
     # with loops in, too
@@ -130,9 +130,9 @@ def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
     assert whole is not None
     assert whole[1] == pytest.approx(sum(c.dof for c in alone.values()), abs=1e-6)
     # no test of covariances is made of them; of the same residuals of a class that measures, one is
-    for name, said in (("tie", False), ("loop", True)):
+    for name, tested in (("tie", False), ("loop", True)):
         found = ResidualConsistency({name: replace(classes["tie"], name=name)}, None, None).evidence([])
-        assert any(t.name == f"χ² of {name}" for t in found) == said
+        assert any(t.name == f"χ² of {name}" for t in found) == tested
 
 
 def test_places_of_a_graph_are_those_of_its_submaps() -> None:

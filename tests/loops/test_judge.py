@@ -25,15 +25,15 @@ def arrays(loops: list[Loop]):
 @pytest.mark.parametrize("kind", KINDS)
 def test_half_of_the_loops_wrong(dim: int, kind: Kind) -> None:
     poses = square_poses(dim)
-    wrong_taken, right_taken, right_all = 0, 0, 0
+    wrong_accepted, right_accepted, right_all = 0, 0, 0
     for seed in range(3):
         rng = np.random.default_rng(seed)
         loops, wrong = inject_wrong_loops(right_loops(poses, rng, 8), poses, 0.5, rng, kind=kind, period=4.0)
         good = truncated_least_squares_inliers(*chain_of(poses, rng), arrays(loops))
-        wrong_taken += int((good & wrong).sum())
-        right_taken, right_all = right_taken + int((good & ~wrong).sum()), right_all + int((~wrong).sum())
-    assert wrong_taken <= 3  # of 24: one group that a short chain bears, for which others must speak
-    assert right_taken >= 0.95 * right_all
+        wrong_accepted += int((good & wrong).sum())
+        right_accepted, right_all = right_accepted + int((good & ~wrong).sum()), right_all + int((~wrong).sum())
+    assert wrong_accepted <= 3  # of 24: one group that a short chain bears, for which others must speak
+    assert right_accepted >= 0.95 * right_all
 
 
 def test_a_second_opinion_changes_what_was_taken_only_for_more_loops() -> None:

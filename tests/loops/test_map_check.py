@@ -26,11 +26,11 @@ def shares(rng: np.random.Generator, angle: float, n: int) -> Array:
 def test_maps_tell_which_solution_is_right(rng) -> None:
     right, moved = shares(rng, 0.05, 30), shares(rng, 0.4, 30)
     good, bad = shares(rng, 0.05, 3), shares(rng, 0.4, 3)
-    said = overlap_log_likelihood_ratio(right, moved, good, bad)
-    assert said > -np.log(ERROR)
-    assert overlap_log_likelihood_ratio(right, moved, bad, good) == pytest.approx(-said)
-    assert choose_group(np.full(3, 1.0), np.full(2, 500.0), said)[0] == "changes"
-    assert choose_group(np.full(2, 500.0), np.full(3, 1.0), -said)[0] == "stays"
+    ratio = overlap_log_likelihood_ratio(right, moved, good, bad)
+    assert ratio > -np.log(ERROR)
+    assert overlap_log_likelihood_ratio(right, moved, bad, good) == pytest.approx(-ratio)
+    assert choose_group(np.full(3, 1.0), np.full(2, 500.0), ratio)[0] == "changes"
+    assert choose_group(np.full(2, 500.0), np.full(3, 1.0), -ratio)[0] == "stays"
     # both solutions are wrong alike, or too few tell how maps lie on each other
     assert overlap_log_likelihood_ratio(right, moved, bad, bad) == pytest.approx(0.0, abs=1e-9)
     assert overlap_log_likelihood_ratio(right[: FEWEST - 1], moved, good, bad) == 0.0
@@ -84,13 +84,13 @@ def test_one_right_loop_stands_against_three_wrong_ones_by_what_the_maps_say() -
         away = np.linalg.norm(g.log(g.between(true, T))[:, 3:], axis=1)
         return np.where(away > 1.0, 0.2, 0.004) + 0.003 * rng.random(len(loops))
 
-    taken = []
+    outcomes = []
     for asked in (None, map_check):
         T, P = chain_of(poses, np.random.default_rng(7))
         closer = LoopCloser(LoopNetwork(T, P), T, P, judge=truncated_least_squares_inliers, map_check=asked)
         closer.propose([*calm, *wrong])
         (d,) = closer.propose([one])
-        taken.append((len(closer.accepted), d.verdict))
+        outcomes.append((len(closer.accepted), d.verdict))
         if asked is not None:
             assert all("the maps say so" in closer.ledger.of(n).why for n in range(12, 15))
-    assert taken == [(15, "rejected"), (13, "accepted")]
+    assert outcomes == [(15, "rejected"), (13, "accepted")]

@@ -42,27 +42,27 @@ def two(drives: tuple[HallDrive, HallDrive]) -> TwoSessions:
 
 
 def test_right_ties_are_found_from_nothing(drives: tuple, two: TwoSessions) -> None:
-    ties = two.find(CONFIG)
-    assert not ties.why
-    assert len(ties.chosen) >= CONFIG.least
+    result = two.find(CONFIG)
+    assert not result.why
+    assert len(result.chosen) >= CONFIG.least
     where = [d.path.interpolate(m.places.time) for d, m in zip(drives, (two.known, two.new))]
     chi2 = []
-    for x in ties.chosen:
+    for x in result.chosen:
         e = se3.se3_log(se3.se3_between(x.T_ij, se3.se3_between(where[0][x.i], where[1][x.j])))
         assert np.linalg.norm(e[3:]) < 0.4
         chi2.append(e @ np.linalg.solve(x.covariance, e))
     assert np.median(chi2) < chi2_quantile(0.99, 6)
-    assert len({(x.i, x.j) for x in ties.chosen}) == len(ties.chosen)
+    assert len({(x.i, x.j) for x in result.chosen}) == len(result.chosen)
     # the true poses of the nodes in their own frames give the start
     own = [se3.se3_between(np.broadcast_to(w[0], w.shape), w) for w in where]
-    e = se3.se3_log(se3.se3_between(session_start(ties.chosen, own[0], own[1]), truth_between(*drives)))
+    e = se3.se3_log(se3.se3_between(session_start(result.chosen, own[0], own[1]), truth_between(*drives)))
     assert np.linalg.norm(e[3:]) < 1.0
     assert abs(e[2]) < 0.05
-    rows = ties.rows()
-    assert len(rows) == len(ties.loops)
-    assert sum(bool(r["accepted"]) for r in rows) == len(ties.chosen)
-    apart = two.thinned(ties.chosen, 12.0)
-    assert 1 <= len(apart) <= len(ties.chosen)
+    rows = result.rows()
+    assert len(rows) == len(result.loops)
+    assert sum(bool(r["accepted"]) for r in rows) == len(result.chosen)
+    apart = two.thinned(result.chosen, 12.0)
+    assert 1 <= len(apart) <= len(result.chosen)
     for k, x in enumerate(apart):
         for y in apart[:k]:
             same = two.known.places.submap[x.i] == two.known.places.submap[y.i]
@@ -71,10 +71,10 @@ def test_right_ties_are_found_from_nothing(drives: tuple, two: TwoSessions) -> N
 
 def test_sessions_that_do_not_overlap_are_reported(two: TwoSessions) -> None:
     elsewhere = hall_drive(corridor(120.0), straight_path(-15.0, 15.0, 0.0), np.random.default_rng(5))
-    ties = TwoSessions(two.known, SessionMap(elsewhere.submaps)).find(CONFIG)
-    assert "looked alike" in ties.why
-    assert ties.chosen == []
-    assert not any(r["accepted"] for r in ties.rows())
+    result = TwoSessions(two.known, SessionMap(elsewhere.submaps)).find(CONFIG)
+    assert "looked alike" in result.why
+    assert result.chosen == []
+    assert not any(r["accepted"] for r in result.rows())
 
 
 def made(
@@ -105,17 +105,17 @@ def test_agreement_decides_and_two_places_are_not_guessed_between(two: TwoSessio
     stray = made(two, true, [(4, 4)], rng)
     stray[0] = replace(stray[0], T_ij=se3.se3_compose(stray[0].T_ij, se3.se3_exp([0, 0, 1.0, 5.0, 0, 0])))
     failed = [replace(right[0], why="fitness 0.1 < 0.8")]
-    ties = two.agree([*right, *wrong, *stray, *failed], CONFIG)
-    assert not ties.why
-    assert ties.accepted.tolist() == [True] * 5 + [False] * 4
-    assert ties.rival == 2
-    assert "contradicts" in ties.reasons[5]
-    assert ties.reasons[-1].startswith("registration")
-    assert [x.j for x in ties.chosen] == [2, 4, 6, 8, 10]  # of the session's own chain
+    result = two.agree([*right, *wrong, *stray, *failed], CONFIG)
+    assert not result.why
+    assert result.accepted.tolist() == [True] * 5 + [False] * 4
+    assert result.rival == 2
+    assert "contradicts" in result.reasons[5]
+    assert result.reasons[-1].startswith("registration")
+    assert [x.j for x in result.chosen] == [2, 4, 6, 8, 10]  # of the session's own chain
     alike = made(two, alias, [(2, 3), (6, 5), (9, 9)], rng)
-    ties = two.agree([*right, *alike], CONFIG)
-    assert "could be two places" in ties.why
-    assert ties.chosen == []
+    result = two.agree([*right, *alike], CONFIG)
+    assert "could be two places" in result.why
+    assert result.chosen == []
     few = two.agree(right[:2], CONFIG)
     assert "2 agree, wanted 3" in few.why
     near = made(two, true, [(1, 2), (2, 3), (3, 2)], rng)

@@ -113,8 +113,8 @@ def test_in_another_map_by_the_entries_that_are_believed(dim: int) -> None:
     assert by <= {((10, 11), (11, 12))}
     assert {int(places.submap[x.i]) for x in last} <= {0, 1}
     # one that does not hold the other's scans left its map again
-    gone = [drives[0], replace(drives[1], report={"holds": [11], "entered": "match"}), drives[2]]
-    assert all(places.submap[x.i] != 0 or places.submap[x.j] == 0 for x in overlap_candidates(gone, places, {(10, 11)}))
+    held = [drives[0], replace(drives[1], report={"holds": [11], "entered": "match"}), drives[2]]
+    assert all(places.submap[x.i] != 0 or places.submap[x.j] == 0 for x in overlap_candidates(held, places, {(10, 11)}))
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -133,15 +133,15 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
         solver.solve_to_optimum()
         closer = find_loops(graph, solver, drives, config)
         names = [closer.loops[n].source for n in closer.accepted]
-        ties = [closer.loops[n] for n in closer.accepted if closer.loops[n].source == "tie"]
+        overlaps = [closer.loops[n] for n in closer.accepted if closer.loops[n].source == "tie"]
         if not right:
-            assert all(x.submaps[0] == x.submaps[1] for x in ties)
+            assert all(x.submaps[0] == x.submaps[1] for x in overlaps)
         return graph, names
 
     config = FindConfig(front_end=True, rounds=0)
-    graph, taken = solved(config)
-    assert taken.count("front-end") == int(right)
-    assert taken.count("tie") >= 4
+    graph, sources = solved(config)
+    assert sources.count("front-end") == int(right)
+    assert sources.count("tie") >= 4
     without, _ = solved(replace(config, ties=None))
     end = graph.submaps[-1].exit_node
     P, P0 = (g.covariance().poses()[end] for g in (graph, without))

@@ -112,9 +112,9 @@ def test_the_fused_map_is_without_it_whatever_path_it_is_of(made):
         np.zeros((0, 2, 2)), none,
     )  # fmt: skip
     fused = make_run_map(submaps, solved)
-    gone, every = fused.moving
+    removed, every = fused.moving
     assert every == sum(len(m) for m in truth)
-    assert gone == sum(m.sum() for m in moving_points(submaps, bases))
+    assert removed == sum(m.sum() for m in moving_points(submaps, bases))
     on = np.concatenate([bases[k, :3] + s.cloud.points[m] for k, (s, m) in enumerate(zip(submaps, truth))])
     assert fused.fused.grid.occupied_at(on[on[:, 2] > -0.4]).mean() < 0.05
 

@@ -94,13 +94,13 @@ def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegS
     exact = own_evidence_of(result.segmap, chain, submaps)
     entered = [m for m in submaps if m.report["entered"] != "new"]
     assert entered
-    told, _ = own_evidence(submaps)
+    separated, _ = own_evidence(submaps)
     for m in submaps:
         whole, own = m.grid.voxel_counts().known, exact[m.key].voxel_counts().known  # type: ignore[union-attr]
         if m in entered:
             assert own < 0.8 * whole
             # what can be told without the run is about as much
-            assert told[m.key].voxel_counts().known == pytest.approx(own, rel=0.25)
+            assert separated[m.key].voxel_counts().known == pytest.approx(own, rel=0.25)
         else:
             assert exact[m.key] is m.grid
     # along the path of the map sample, the map is nearer to that of the scans than with everything twice
@@ -108,7 +108,7 @@ def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegS
     poses = path.interpolate(np.clip(result.steps.times, path.times[0], path.times[-1]))
     scans = insert(result.steps, poses, 0.2, submaps[0].grid.model)  # type: ignore[union-attr]
     off = []
-    for grids in (None, told, exact):
+    for grids in (None, separated, exact):
         divided = divide_submaps(submaps, own=False, grids=grids, config=DivisionConfig(reach=9.0))
         off.append(abs(fuse_pieces(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
     assert off[2] < off[0]

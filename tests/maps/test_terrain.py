@@ -69,7 +69,7 @@ def lines_of(points: Array, feet: float = 0.0) -> ScanLines:
     return ScanLines(p, np.tile([0.0, 0.05, H], (len(p), 1)), np.full(len(p), feet))
 
 
-def said(points: Array) -> dict[int, dict[int, int]]:
+def observed(points: Array) -> dict[int, dict[int, int]]:
     """Channel → ix of cells of 0.1 m → value, in one band of 0.1 m up to 20 m."""
     rows = np.concatenate(list(observe_terrain(lines_of(points), np.array([20.0]), np.array([0.1]), VEHICLE)))
     out: dict[int, dict[int, int]] = {k: {} for k in range(4)}
@@ -82,16 +82,16 @@ LEVEL = [(-1.0, 0.0)]
 
 
 def test_a_curb_is_a_step_where_it_is_and_nowhere_else() -> None:
-    steps = said(profile_line([], [(-1.0, 0.0), (3.02, 0.1)]))[STEP]
+    steps = observed(profile_line([], [(-1.0, 0.0), (3.02, 0.1)]))[STEP]
     high = [ix for ix, value in steps.items() if value >= 6]
     assert high
     assert all(29 <= ix <= 31 for ix in high)
     assert max(steps.values()) in (7, 8, 9, 10)
-    assert max(said(profile_line([], LEVEL))[STEP].values()) == 0
+    assert max(observed(profile_line([], LEVEL))[STEP].values()) == 0
 
 
 def test_a_hole_lacks_support_and_the_ground_before_and_behind_it_does_not() -> None:
-    found = said(profile_line([], [(-1.0, 0.0), (2.5, -0.6), (3.5, 0.0)]))
+    found = observed(profile_line([], [(-1.0, 0.0), (2.5, -0.6), (3.5, 0.0)]))
     support = found[SUPPORT]
     # the beam over the edge meets the far wall 0.44 m below; a legal slope would lead 0.27 m down
     assert max(support[ix] for ix in range(27, 34)) >= 15
@@ -101,12 +101,12 @@ def test_a_hole_lacks_support_and_the_ground_before_and_behind_it_does_not() -> 
 
 def test_stairs_down_lack_support() -> None:
     floor = [(-1.0, 0.0), *((2.0 + 0.28 * k, -0.17 * (k + 1)) for k in range(8))]
-    support = said(profile_line([], floor))[SUPPORT]
+    support = observed(profile_line([], floor))[SUPPORT]
     assert max(value for ix, value in support.items() if 20 <= ix <= 30) >= 15
 
 
 def test_what_an_obstacle_hides_is_unknown_not_missing() -> None:
-    found = said(profile_line([(3.0, 4.0, 0.0, 0.9)], LEVEL))
+    found = observed(profile_line([(3.0, 4.0, 0.0, 0.9)], LEVEL))
     assert any(28 <= ix <= 31 for ix in found[OVERHANG])
     hidden = [ix for ix in found[SUPPORT] if 41 <= ix <= 100]
     assert not hidden
@@ -115,7 +115,7 @@ def test_what_an_obstacle_hides_is_unknown_not_missing() -> None:
 
 @pytest.mark.parametrize(("height", "channel"), [(1.2, OVERHANG), (2.5, ABOVE)])
 def test_a_wire_is_an_obstacle_only_within_the_height_of_the_vehicle(height: float, channel: int) -> None:
-    found = said(profile_line([(3.2, 3.3, height - 0.05, height)], LEVEL))
+    found = observed(profile_line([(3.2, 3.3, height - 0.05, height)], LEVEL))
     other = ABOVE if channel == OVERHANG else OVERHANG
     assert set(found[channel])
     assert set(found[channel]) <= {31, 32, 33}
@@ -126,7 +126,7 @@ def test_a_wire_is_an_obstacle_only_within_the_height_of_the_vehicle(height: flo
 def test_a_legal_ramp_is_ground_and_a_steep_one_is_a_step() -> None:
     def ramp(angle: float) -> dict[int, int]:
         steps = [(3.0 + 0.01 * k, 0.01 * k * math.tan(math.radians(angle))) for k in range(300)]
-        return said(profile_line([], [(-1.0, 0.0), *steps]))[STEP]
+        return observed(profile_line([], [(-1.0, 0.0), *steps]))[STEP]
 
     assert max(ramp(10.0).values()) <= 3
     assert max(value for ix, value in ramp(25.0).items() if ix > 32) >= 6
@@ -196,9 +196,9 @@ def test_a_fall_begins_on_ground_that_the_vehicle_can_be_on() -> None:
     low = np.column_stack([np.arange(7.4, 8.5, 0.1), np.full(11, -0.5)])
     assert max(missing(np.concatenate([road[:6], hedge, wide, low]))) > 30
     # level road, and a fall of less than the vehicle climbs, or of more
-    for depth, told in ((0.08, False), (0.5, True)):
+    for depth, lacks in ((0.08, False), (0.5, True)):
         floor = np.column_stack([np.arange(5.62, 7.3, 0.1), np.full(17, -depth)])
-        assert bool(missing(np.concatenate([road[:15], floor]))) is told
+        assert bool(missing(np.concatenate([road[:15], floor]))) is lacks
     # the lowest beams of a scanner meet a bumper, and nothing is seen of the road before it
     first = np.array([[3.6, 0.24], [3.7, 0.25], [3.8, 0.25]])
     behind = np.column_stack([np.linspace(4.8, 6.0, 13), np.zeros(13)])
@@ -537,11 +537,11 @@ def test_cost_maps_are_files_of_a_map_server(tmp_path: Path) -> None:
     for mode in ("raw", "scale"):
         yaml, image = save_cost_map(costs, tmp_path / f"{mode}.yaml", mode=mode)
         assert image.suffix == (".pgm" if mode == "raw" else ".png")
-        cells, said = read_map_server(yaml)
+        cells, info = read_map_server(yaml)
         np.testing.assert_array_equal(cells, wanted)
-        assert said["mode"] == mode
-        assert said["resolution"] == costs.cell
-        np.testing.assert_allclose(said["origin"], [*costs.origin, 0.0], atol=1e-6)
+        assert info["mode"] == mode
+        assert info["resolution"] == costs.cell
+        np.testing.assert_allclose(info["origin"], [*costs.origin, 0.0], atol=1e-6)
     # every value that a cell may have, in either mode
     every = dataclasses.replace(costs, cost=np.geomspace(1.0, 1e4, costs.cost.size).reshape(costs.cost.shape))
     for mode in ("raw", "scale"):

@@ -69,8 +69,8 @@ def draw(found: list[tuple[str, Mutant]], count: int, seed: int) -> list[tuple[s
     for file, m in shuffled:
         first.setdefault((file, m.function), (file, m))
     chosen = list(first.values())[:count]
-    taken = {id(m) for _, m in chosen}
-    chosen += [(f, m) for f, m in shuffled if id(m) not in taken][: count - len(chosen)]
+    drawn = {id(m) for _, m in chosen}
+    chosen += [(f, m) for f, m in shuffled if id(m) not in drawn][: count - len(chosen)]
     return sorted(chosen, key=lambda c: (c[0], c[1].line, c[1].new))
 
 
@@ -110,10 +110,10 @@ def check(name: str, module: dict[str, list[str]], count: int | None, seed: int,
     limits: dict[str, float] = {}
     for file in dict.fromkeys(file for file, _ in chosen):
         tests[file] = [str(ROOT / t) for t in module["tests"]]
-        code, seconds, said = outcome(file, (ROOT / file).read_text(), tests[file], 900.0)
+        code, seconds, output = outcome(file, (ROOT / file).read_text(), tests[file], 900.0)
         if code != 0:
             why = "never import it" if code == UNUSED else "fail without any change"
-            raise SystemExit(f"{name}: the tests of {file} {why}\n{said}")
+            raise SystemExit(f"{name}: the tests of {file} {why}\n{output}")
         limits[file] = 60.0 + 4.0 * seconds
     print(f"{name}: {len(chosen)} of {len(found)} mutants, seed {seed}", flush=True)
     for file, m in chosen:

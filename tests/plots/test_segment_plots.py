@@ -53,26 +53,26 @@ def test_scores_are_drawn_with_the_boundaries_and_their_reasons() -> None:
 def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> None:
     m = two_sides()
     sample = grow_sample(m, root_of_segment(m, 2), np.random.default_rng(0))
-    paths, ties, labels = sample_paths(m, sample)
+    paths, matches, labels = sample_paths(m, sample)
     assert labels == ["0", "1", "2m"]
-    assert len(ties) == 1
+    assert len(matches) == 1
     whole = concatenate_segments(m, sample)
     np.testing.assert_allclose(np.concatenate([paths[0], paths[1][1:], paths[2][1:]]), whole.positions, atol=1e-12)
     # the match: from the entry of segment 2 to the nearest pose of segment 0, at its end
     k = sample.segments.tolist().index(0)
-    np.testing.assert_allclose(ties[0].there, se2_compose(sample.poses[k], m[0].path[-1])[:2], atol=1e-12)
-    np.testing.assert_allclose(ties[0].here, [1.9, 2.1], atol=1e-12)
+    np.testing.assert_allclose(matches[0].there, se2_compose(sample.poses[k], m[0].path[-1])[:2], atol=1e-12)
+    np.testing.assert_allclose(matches[0].here, [1.9, 2.1], atol=1e-12)
     # the root is the last segment: seen from the first, everything is moved as one, and the first stands at the origin
-    early, first_ties, same = sample_paths(m, sample, frame="first")
+    early, first_matches, same = sample_paths(m, sample, frame="first")
     assert same == labels
     np.testing.assert_allclose(early[0], m[0].path[:, :2], atol=1e-12)
     moved = sample.poses[k]
-    for here, there in zip([*early, first_ties[0].there[None]], [*paths, ties[0].there[None]]):
+    for here, there in zip([*early, first_matches[0].there[None]], [*paths, matches[0].there[None]]):
         back = se2_compose(np.broadcast_to(moved, (len(here), 3)), np.column_stack([here, np.zeros(len(here))]))
         np.testing.assert_allclose(back[:, :2], there, atol=1e-12)
     with pytest.raises(ConfigError, match="frame"):
         sample_paths(m, sample, frame="last")  # type: ignore[arg-type]
-    ax = plot_segments(None, paths, ties=ties, labels=labels, truth=whole)
+    ax = plot_segments(None, paths, ties=matches, labels=labels, truth=whole)
     assert "matches (1)" in texts(ax)
     assert {t.get_text() for t in ax.texts} == set(labels)
     np.testing.assert_allclose(ax.lines[1].get_xydata(), paths[0])

@@ -128,8 +128,8 @@ def test_bands_of_a_pyramid_are_named_with_their_share() -> None:
     zero = np.zeros((4, 5))
     found = TerrainMap(np.array([-1.0, 2.0]), 0.5, known, np.zeros((4, 5), np.int8), zero, zero, band, zero > 0)
     ax = plot_bands(found, (0.5, 1.0), place=(0.0, 3.0))
-    said = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert said == ["cells of 0.5 m (30%)", "cells of 1 m (20%)", "vehicle"]
+    labels = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert labels == ["cells of 0.5 m (30%)", "cells of 1 m (20%)", "vehicle"]
     shown = ax.get_images()[0].get_array()
     np.testing.assert_array_equal(np.ma.filled(shown, -1), band)
     assert tuple(ax.get_images()[0].get_extent()) == (-1.0, 1.5, 2.0, 4.0)

@@ -135,11 +135,11 @@ class SlowParticle:
                 nearest[o] = min(nearest[o], d2)
                 if d2 < cfg["gate"][len(ch)]:
                     pairs.append((d2 + np.log(np.linalg.det(S)), o, j))
-        match, taken = {}, set()
+        match, used = {}, set()
         for _, o, j in sorted(pairs):
-            if o not in match and j not in taken:
+            if o not in match and j not in used:
                 match[o] = j
-                taken.add(j)
+                used.add(j)
         return match, nearest, polar
 
     def _drop_spurious(self, first_obs, n_obs, polar, cfg):

@@ -14,20 +14,20 @@ KEYS = {"image", "mode", "resolution", "origin", "negate", "occupied_thresh", "f
 
 def read_map_server(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Cells ``(ny, nx)`` of the occupancy grid, the row of the smallest y first: 0 to 100, −1 unknown; and the YAML."""
-    said = yaml.safe_load(path.read_text())
-    assert set(said) <= KEYS
-    assert len([float(v) for v in said["origin"]]) == 3
-    low, high, mode = said["free_thresh"], said["occupied_thresh"], said.get("mode", "trinary")
+    info = yaml.safe_load(path.read_text())
+    assert set(info) <= KEYS
+    assert len([float(v) for v in info["origin"]]) == 3
+    low, high, mode = info["free_thresh"], info["occupied_thresh"], info.get("mode", "trinary")
     assert 0.0 < low < high < 1.0
-    assert said["resolution"] > 0.0
-    file = path.parent / said["image"]
+    assert info["resolution"] > 0.0
+    file = path.parent / info["image"]
     assert file.read_bytes().startswith(b"P5\n" if file.suffix == ".pgm" else b"\x89PNG")
     image = Image.open(file)
     data = np.asarray(image, dtype=float)
     alpha = data[..., -1] if image.mode in ("LA", "RGBA") else np.full(data.shape[:2], 255.0)
     grey = data if data.ndim == 2 else data[..., :1].mean(axis=-1)
     shade = grey / 255.0
-    occupied = shade if said["negate"] else 1.0 - shade
+    occupied = shade if info["negate"] else 1.0 - shade
     if mode == "raw":
         value = np.round(255.0 * shade)
         cells = np.where(value <= 100, value, -1)
@@ -36,4 +36,4 @@ def read_map_server(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
         cells = np.where(occupied > high, 100, np.where(occupied < low, 0, between))
         if mode == "scale":
             cells = np.where(alpha < 255, -1, cells)
-    return cells[::-1].astype(int), said
+    return cells[::-1].astype(int), info

@@ -190,8 +190,8 @@ class Layout:
         at = np.full(n + len(network.landmark_ids), -1)
         at[nodes] = np.arange(len(nodes))
         i, j = at[np.concatenate([network.edges, network.observations + [0, n]])].T
-        tied = (i >= 0) & (j >= 0)
-        order = elimination_order(i[tied], j[tied], len(nodes)) if len(nodes) else nodes
+        free_pair = (i >= 0) & (j >= 0)
+        order = elimination_order(i[free_pair], j[free_pair], len(nodes)) if len(nodes) else nodes
         return cls._in_order(network, nodes[order])
 
     @classmethod

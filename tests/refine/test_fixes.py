@@ -127,8 +127,8 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
     g = group_of(truth)
     errors = [np.sqrt(np.mean(g.log(g.between(truth, r.poses))[:, 3:] ** 2)) for r in (white, correlated)]
     assert errors[1] < errors[0]
-    told = {f.code: f for f in refinement_findings(white)}
-    assert told["refine-fixes"].level == "look"
+    findings = {f.code: f for f in refinement_findings(white)}
+    assert findings["refine-fixes"].level == "look"
     assert {f.code: f for f in refinement_findings(correlated)}["refine-fixes"].level == "good"
 
 

@@ -61,8 +61,8 @@ def test_biases_of_wheels_are_found() -> None:
     turned = np.diff(np.unwrap(true[:, 2])).sum()
     t, b = found.yaw_bias.T
     bias = float(np.sum(0.5 * (b[1:] + b[:-1]) * np.diff(t)))
-    told = bias + found.constants["bend"][0] * metres + found.constants["turn"][0] * turned
-    assert told == pytest.approx(0.02 * metres, rel=0.1)
+    total = bias + found.constants["bend"][0] * metres + found.constants["turn"][0] * turned
+    assert total == pytest.approx(0.02 * metres, rel=0.1)
 
 
 def test_a_wheel_that_slips_once_bends_nothing() -> None:

@@ -189,15 +189,15 @@ def test_what_noise_of_normals_feigns_is_not_held(rng, dim):
         v, A = of_group(g, poses[pairs.i[some]], centre, Ji[some])
         u, B = of_group(g, poses[pairs.j[some]], centre, Jj[some])
         np.testing.assert_allclose(u, -v, atol=1e-6)
-        said = (v.T * w[some]) @ v
+        information = (v.T * w[some]) @ v
         noise_induced = sum(
             (x.T * w[some]) @ x for x in (of_group(g, poses[pairs.i[some]], centre, t[some])[0] for t in tilted)
         )
-        values, V = eigh(said, noise_induced)
+        values, V = eigh(information, noise_induced)
         share = noise_induced @ V @ np.diag(np.maximum(1.0 - NOISE_INDUCED / values, 0.0)) @ V.T
         assert 0 < np.sum(values > NOISE_INDUCED) < d or dim == 2
         np.testing.assert_allclose(
-            share @ said @ share.T, holds.share[m] @ said @ holds.share[m].T, rtol=1e-4, atol=1e-3
+            share @ information @ share.T, holds.share[m] @ information @ holds.share[m].T, rtol=1e-4, atol=1e-3
         )
         kept = v @ holds.share[m].T
         Ji[some] = np.einsum("kij,ki->kj", A, kept)

@@ -81,17 +81,17 @@ def test_joint_covariance_holds_that_of_each_step(drives):
 
 
 def test_motion_noisier_than_stated_is_widened_and_consistent():
-    values, scales, said = [], [], []
+    values, scales, codes = [], [], []
     for seed in (41, 42):
         scans, start, truth = court(seed, wheel_sigma=0.06)  # the front end takes 0.02 for it
         found = refine_by_scans(scans, start)
         values.append(nees_of(found, truth)["nees"])
         scales.append(found.scales)
-        said += [f.code for f in refinement_findings(found)]
+        codes += [f.code for f in refinement_findings(found)]
     assert np.all(np.array(scales)[:, 1] > 1.5)  # along the way
     np.testing.assert_allclose(np.array(scales)[:, 0], 1.0, atol=0.3)  # the gyro is as stated
     assert 0.5 < np.mean(values) < 2.0
-    assert said.count("refine-widened") == 2
+    assert codes.count("refine-widened") == 2
 
 
 def test_motion_as_stated_is_not_widened(drives):
@@ -265,8 +265,8 @@ def test_odometry_better_than_all_that_was_made_of_it_is_the_result(bent, monkey
     assert found.better
     assert not found.input_better
     assert error(scans.times, found.poses, truth) < 0.01
-    said = {f.code: f.level for f in refinement_findings(found)}
-    assert said == {"input-better": "look"}
+    levels = {f.code: f.level for f in refinement_findings(found)}
+    assert levels == {"input-better": "look"}
     # as sure as the motion alone: each step adds its own noise and what lasts, and no scan takes any of it away
     wide = np.sqrt(np.trace(found.covariances[-1][3:, 3:]))
     assert wide >= 0.99 * np.sqrt(sum(np.trace(C[3:, 3:]) for C in good.covariances[1:]))

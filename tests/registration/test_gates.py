@@ -98,8 +98,8 @@ def test_second_modes_are_those_of_the_same_map_at_another_place() -> None:
         return results[k].fitness - max(others) if others else 1.0
 
     np.testing.assert_allclose(match_margins(results, maps, 1.5), [plain(k) for k in range(4)])
-    gone = [results[0], found(8.0, fitness=0.9, converged=False)]
-    assert match_margins(gone, [0, 0], 1.5).tolist() == [1.0, 1.0]
+    failed = [results[0], found(8.0, fitness=0.9, converged=False)]
+    assert match_margins(failed, [0, 0], 1.5).tolist() == [1.0, 1.0]
     assert match_margins(results[:1], [0], 1.5).tolist() == [1.0]
 
 

@@ -161,9 +161,9 @@ def test_a_bay_more_changes_no_other_car() -> None:
     way = plan_route([(0.0, 50.0, 0.0), (10.0, 50.0, 0.0)], 1.0)
     bays = np.array([(3.0 * k, 0.0, np.pi / 2) for k in range(8)])
     meshes = []
-    for taken in (bays, bays[:-1]):
+    for some in (bays, bays[:-1]):
         mesh = MeshBuilder()
-        park_cars(mesh, taken, 0.0, 0.6, KeepClear(way), SeedTree(4).generator())
+        park_cars(mesh, some, 0.0, 0.6, KeepClear(way), SeedTree(4).generator())
         meshes.append(mesh.build()[0])
     assert np.array_equal(meshes[0][: len(meshes[1])], meshes[1])
 

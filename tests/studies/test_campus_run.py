@@ -36,7 +36,7 @@ def run(log: SensorLog, **gps: Any) -> Any:
     return gs.run(log, frontend="scan-window", config=config, progress=False)
 
 
-def said(made: Any, level: str = "") -> set[str]:
+def codes_of(made: Any, level: str = "") -> set[str]:
     return {f.code for f in made.verdict if level in ("", f.level)}
 
 
@@ -47,8 +47,8 @@ def clean(log: SensorLog) -> Any:
 
 def test_a_good_log_is_found_good(clean: Any) -> None:
     assert clean.metric("path_rmse_aligned") < 0.2
-    assert not said(clean) & {"scan-encoder", "gps-not-used", "imu-saturated", "turns-disagree", "motion-gap"}
-    assert "consistency-test" not in said(clean, "bad")
+    assert not codes_of(clean) & {"scan-encoder", "gps-not-used", "imu-saturated", "turns-disagree", "motion-gap"}
+    assert "consistency-test" not in codes_of(clean, "bad")
 
 
 # ---------------------------------------------------------------- the pan encoder
@@ -70,8 +70,8 @@ def test_a_wrong_encoder_is_found_and_named_with_its_size(degrees: float) -> Non
     assert line.level == "bad"
     assert "panning" in line.text
     assert ("too much" if degrees > 0 else "too little") in line.text
-    told = float(line.text.partition("encoder of panning: ")[2].partition(" ±")[0])
-    assert told == pytest.approx(abs(degrees), abs=0.35)
+    size = float(line.text.partition("encoder of panning: ")[2].partition(" ±")[0])
+    assert size == pytest.approx(abs(degrees), abs=0.35)
 
 
 def test_without_a_head_that_turns_there_is_no_encoder(log: SensorLog) -> None:
@@ -128,8 +128,8 @@ def with_a_gap(log: SensorLog) -> SensorLog:
 
 def with_empty_scans(log: SensorLog) -> SensorLog:
     s: RangeScans = log["panning"]
-    gone = np.floor(s.times).astype(int) % 8 == 0
-    return with_streams(log, panning=replace(s, ranges=np.where(gone[:, None], np.nan, s.ranges)))
+    empty = np.floor(s.times).astype(int) % 8 == 0
+    return with_streams(log, panning=replace(s, ranges=np.where(empty[:, None], np.nan, s.ranges)))
 
 
 @pytest.mark.parametrize(
@@ -146,8 +146,8 @@ def test_what_is_wrong_is_reported(
     log: SensorLog, clean: Any, spoil: Callable[[SensorLog], SensorLog], code: set[str], level: str
 ) -> None:
     made = run(spoil(log))
-    assert code & said(made, level)
-    assert not code & said(clean)
+    assert code & codes_of(made, level)
+    assert not code & codes_of(clean)
     if spoil in (with_a_gap, only_at_the_start):  # and survived
         assert made.metric("path_rmse_aligned") < 2.0 * clean.metric("path_rmse_aligned") + 0.1
 

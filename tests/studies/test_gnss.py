@@ -231,8 +231,8 @@ def test_epochs_without_a_node_are_counted():
     nodes = add_odometer(graph, log["odometry"])
     at = np.where(np.arange(len(nodes)) < 3, -1, nodes)
     add_pseudoranges(graph, log["pseudoranges"], PLANE, at)
-    (said,) = [e for e in graph.events if e["event"] == "pseudoranges"]
-    assert (said["epochs"], said["dropped"]) == (9, 21)
+    (event,) = [e for e in graph.events if e["event"] == "pseudoranges"]
+    assert (event["epochs"], event["dropped"]) == (9, 21)
 
 
 def test_a_bias_of_the_turn_rate_is_found():

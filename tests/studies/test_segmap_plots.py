@@ -47,10 +47,10 @@ def test_a_segmap_is_drawn_segment_by_segment() -> None:
     sample = grow_sample(m, root_of_segment(m, len(m) - 1), np.random.default_rng(0))
     ax = plot_segmap(None, m, sample=sample)
     ax.figure.canvas.draw()
-    said = legend_of(ax)
-    assert f"segments ({len(m.alive)} of 2 particles)" in said
-    assert f"those of one map sample ({len(sample)})" in said
-    assert any(t.startswith("entered an older map (2)") for t in said)
+    labels = legend_of(ax)
+    assert f"segments ({len(m.alive)} of 2 particles)" in labels
+    assert f"those of one map sample ({len(sample)})" in labels
+    assert any(t.startswith("entered an older map (2)") for t in labels)
     dark = [x.get_xydata() for x in ax.lines if x.get_lw() == 4.0]
     pale = next(c for c in ax.collections if isinstance(c, LineCollection)).get_segments()
     assert len(dark) + len(pale) == len(m.alive)

@@ -31,8 +31,8 @@ def test_the_quick_one_runs_by_its_command(tmp_path: Path):
         app, ["study", "smartloc", "--quick", "--trials", "1", "--out", str(tmp_path / "s"), "--json"]
     )
     assert out.exit_code == 0, out.output
-    said = json.loads(out.stdout)
-    assert "gauss-markov" in str(said)
+    printed = json.loads(out.stdout)
+    assert "gauss-markov" in str(printed)
     table = open_study(tmp_path / "s").table
     naive, consistent = (
         table[table["algorithm"] == a].set_index("quantity")["value"] for a in ("naive", "gauss-markov")

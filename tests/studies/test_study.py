@@ -180,11 +180,11 @@ def test_ctrl_c_writes_what_is_done_and_leaves_no_worker(tmp_path: Path) -> None
         time.sleep(0.01)
     group = process.pid  # it leads a session of its own
     os.killpg(group, signal.SIGINT)  # as a terminal does: to the workers too
-    _, said = process.communicate(timeout=60)
-    assert process.returncode in (1, 130), said  # the command-line library's habit, or ours
-    assert "stopped; writing what is done" in said
-    assert "Traceback" not in said
-    assert "leaked" not in said
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode in (1, 130), errors  # the command-line library's habit, or ours
+    assert "stopped; writing what is done" in errors
+    assert "Traceback" not in errors
+    assert "leaked" not in errors
     assert gone(group)
     done = pd.read_csv(out / "table.csv")
     assert 3 <= len(done.groupby(["world", "run"])) == len(trial_files(out)) < 800

@@ -28,8 +28,8 @@ def test_the_quick_one_on_the_command_line(tmp_path: Path) -> None:
     assert 0.9 < found["detour"] < 1.6
     assert found["coverage"] > 0.9
     report = (tmp_path / "s" / "report.md").read_text()
-    for said in ("threshold", "sweep", "braking", "speed bound"):
-        assert said in report
+    for text in ("threshold", "sweep", "braking", "speed bound"):
+        assert text in report
 
 
 def test_it_stops_before_a_curb_that_reaches_across() -> None:

@@ -33,8 +33,8 @@ def test_the_quick_one_on_the_command_line(tmp_path: Path) -> None:
     assert mine["quick-fixed", "seen_curb-15", 225] == 1.0
     assert mine["quick", "false_flat", -1] <= 0.01
     report = (tmp_path / "s" / "report.md").read_text()
-    for said in ("climbable step", "threshold", "braking", "coverage", "single-equal"):
-        assert said in report
+    for text in ("climbable step", "threshold", "braking", "coverage", "single-equal"):
+        assert text in report
 
 
 def test_tables_of_the_package_were_learnt_elsewhere() -> None:

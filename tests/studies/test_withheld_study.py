@@ -48,8 +48,8 @@ def test_steady_motion_is_consistent_where_it_is_true(rng):
     found = scores_steady(walked(rng, 1.0, 160), 2.0, 1.0)
     assert 0.75 < found["nees"] < 1.3
     assert found["rmse"] < found["straight"]
-    sure = scores_steady(walked(rng, 1.0, 160), 2.0, 0.2)
-    assert sure["nees"] > 2.0
+    overconfident = scores_steady(walked(rng, 1.0, 160), 2.0, 0.2)
+    assert overconfident["nees"] > 2.0
 
 
 def test_the_quick_one_on_recorded_logs(data_dir: Path, tmp_path: Path):

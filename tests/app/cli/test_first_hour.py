@@ -93,12 +93,12 @@ def test_ctrl_c_in_a_run_is_one_line_that_says_how_to_go_on(tmp_path: Path) -> N
         while not any((out / "submaps").glob("*")) and run.poll() is None and time.monotonic() < until:
             time.sleep(0.01)
         run.send_signal(signal.SIGINT)
-        said = run.communicate()[1]
-    assert run.returncode == 130, said
-    last = said.splitlines()[-1]
+        errors = run.communicate()[1]
+    assert run.returncode == 130, errors
+    last = errors.splitlines()[-1]
     assert last.startswith("graphslam: interrupted; finished submaps are saved; resume with:")
     assert last.endswith(f"{' '.join(typed[2:])} --resume")
-    assert "Traceback" not in said
+    assert "Traceback" not in errors
     more = subprocess.run([*command, *typed, "--resume", "--json"], capture_output=True, text=True, check=True)
     assert json.loads(more.stdout)
 

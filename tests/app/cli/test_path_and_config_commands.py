@@ -27,7 +27,7 @@ from graphslam.io.tum import read_path, write_kitti, write_tum
 LINES = {name: text for group in GROUPS.values() for name, text in group.items()}
 
 
-def said(*arguments: object) -> str:
+def printed(*arguments: object) -> str:
     done = CliRunner().invoke(app, [str(a) for a in arguments])
     assert done.exit_code == 0, (done.output, done.exception)
     return done.stdout
@@ -72,7 +72,7 @@ def test_eval_of_tum_and_kitti_files_is_the_textbook_figure(
     wanted = np.sqrt(np.mean(np.sum(((p - p.mean(0)) @ R.T + q.mean(0) - q) ** 2, axis=1)))
     picture = folder / f"{ending}.png"
     command = ["eval", folder / f"estimate.{ending}", folder / f"reference.{ending}", "--save-plot", picture, "--json"]
-    value = json.loads(said(*command))
+    value = json.loads(printed(*command))
     assert value["ate"]["rmse"] == pytest.approx(wanted, rel=1e-6)
     assert value["ate"]["pairs"] == len(reference)
     assert "nees" not in value
@@ -135,14 +135,14 @@ def log_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_init_writes_every_option_and_changes_nothing(log_folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "own.toml"
-    said("init", log_folder, "-o", out)
+    printed("init", log_folder, "-o", out)
     text = out.read_text()
     assert tomllib.loads(text) == {}
     for row in [*option_rows("rbpf-ekf"), *option_rows()]:
         assert f"# {row.option} = " in text, row.option
     again = CliRunner().invoke(app, ["init", str(log_folder), "-o", str(out)])
     assert "--force" in str(again.exception)
-    said("init", log_folder, "-o", out, "--force")
+    printed("init", log_folder, "-o", out, "--force")
     assert out.read_text() == text
 
 

@@ -139,20 +139,20 @@ def test_points_drawn_are_those_of_the_files(folder: Path, page: str, tmp_path: 
 
 @needs_chromium
 def test_withheld_fixes_are_drawn_with_their_sigmas(folder: Path, page: str, tmp_path: Path) -> None:  # noqa: F811
-    said = json.loads((folder / "run.json").read_text())["gps_innovations"]
+    stored = json.loads((folder / "run.json").read_text())["gps_innovations"]
     found = act(page, tmp_path, LOOK + "return look();", before=RECORDED)
     with np.load(folder / "map.npz") as a:
         begin = a["trajectory_times"][0]
     m = {r["key"]: r["value"] for r in json.loads((folder / "metrics.json").read_text())}
-    assert np.mean(said["nis"]) / 2.0 == pytest.approx(m["gps_nis_each_value"], rel=1e-4)
-    assert len(said["times"]) == m["gps_withheld_fixes"]
+    assert np.mean(stored["nis"]) / 2.0 == pytest.approx(m["gps_nis_each_value"], rel=1e-4)
+    assert len(stored["times"]) == m["gps_withheld_fixes"]
     for name, values in (
-        ("NIS/dof of withheld GPS", np.array(said["nis"]) / 2.0),
-        ("Withheld GPS, x [m]", np.array(said["innovations"])[:, 0]),
-        ("Withheld GPS, y [m]", np.array(said["innovations"])[:, 1]),
+        ("NIS/dof of withheld GPS", np.array(stored["nis"]) / 2.0),
+        ("Withheld GPS, x [m]", np.array(stored["innovations"])[:, 0]),
+        ("Withheld GPS, y [m]", np.array(stored["innovations"])[:, 1]),
     ):
         drawn = read(found[name], "dots", log=name.startswith("NIS"))
-        assert drawn[:, 0] == pytest.approx(np.array(said["times"]) - begin, abs=0.05)
+        assert drawn[:, 0] == pytest.approx(np.array(stored["times"]) - begin, abs=0.05)
         assert drawn[:, 1] == pytest.approx(values, rel=2e-3, abs=2e-3)
 
 
@@ -227,9 +227,9 @@ def test_a_run_without_truth_shows_what_it_has(tmp_path: Path) -> None:
     found = act(make_report(out).html, tmp_path, LOOK + "return look();", before=RECORDED, width=390)
     (shown,) = found.values()
     assert list(found) == ["χ²/dof by class of factor"]
-    told = {w[0].rsplit("  ", 1)[0]: float(w[0].rsplit("  ", 1)[1]) for w in shown["words"] if "  " in w[0]}
+    values = {w[0].rsplit("  ", 1)[0]: float(w[0].rsplit("  ", 1)[1]) for w in shown["words"] if "  " in w[0]}
     classes = [c for c in report["graph"]["classes"] if c["chi2_per_dof"] is not None and c["dof"] > 0]
-    assert told == pytest.approx({c["class"]: c["chi2_per_dof"] for c in classes}, rel=1e-3)
+    assert values == pytest.approx({c["class"]: c["chi2_per_dof"] for c in classes}, rel=1e-3)
     report["graph"]["classes"] = []
     (out / "run.json").write_text(json.dumps(report))
     bare = make_report(out).html

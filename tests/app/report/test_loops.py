@@ -84,17 +84,17 @@ def as_cell(value: Any) -> str:
 
 def check_rows(folder: Path) -> list[dict[str, str]]:
     """The page holds the rows of ``graphslam loops``, each once."""
-    told = json.loads(CliRunner().invoke(app, ["loops", str(folder), "--json"]).stdout)
+    printed = json.loads(CliRunner().invoke(app, ["loops", str(folder), "--json"]).stdout)
     page = Page(make_report(folder).html)
     page.check_alone()
     rows = {int(r["loop"]): r for r in shown(page)}
-    assert len(rows) == len(shown(page)) == len(told["loops"])
-    for expected in told["loops"]:
+    assert len(rows) == len(shown(page)) == len(printed["loops"])
+    for expected in printed["loops"]:
         row = rows[expected["loop"]]
         for key, heading in COLUMNS.items():
             if key != "gates":
                 assert row[heading] == as_cell(expected[key]), (key, expected)
-    for verdict, n in told["counts"].items():
+    for verdict, n in printed["counts"].items():
         assert f"{n} {verdict}" in page.sections["loops"]
     return shown(page)
 
@@ -198,8 +198,8 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     bases = {"bases": nodes, "base_covariances": np.zeros((6, 3, 3))}
     whole = {"format": MERGED_DENSE_FORMAT, "sessions": np.array(["a", "b"]), **of_submaps, **bases}
     write_npz(tmp_path / "merged.npz", {**whole, "nodes": nodes})
-    tie = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
-    candidates = [{**tie, "accepted": True, "why": "agrees"}, {**tie, "accepted": False, "why": "<b>no</b>"}]
+    row = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
+    candidates = [{**row, "accepted": True, "why": "agrees"}, {**row, "accepted": False, "why": "<b>no</b>"}]
     sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "ties": 1, "candidates": candidates}]
     report = {"format": "graphslam.merge/1", "by": "auto", "solver": "batch", "sessions": sessions}
     (tmp_path / "merge.json").write_text(json.dumps(report))
@@ -212,8 +212,8 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     page.check_alone()
     assert len(page.sources) == 1
     assert "loop closures between them" in page.sections["figures"]
-    ties = page.table("loops", "submap in the map").records()
-    assert [(r["verdict"], r["why"], r["gates"]) for r in ties] == [
+    listed = page.table("loops", "submap in the map").records()
+    assert [(r["verdict"], r["why"], r["gates"]) for r in listed] == [
         ("accepted", "agrees", "a 0.5"),
         ("rejected", "<b>no</b>", "a 0.5"),
     ]

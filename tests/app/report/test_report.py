@@ -133,12 +133,12 @@ def test_an_unsolved_run_is_called_so(copy: Path) -> None:
 
 
 def test_an_imu_of_other_axes_is_reported_at_once(copy: Path) -> None:
-    said = {"event": "imu-axes", "stream": "imu", "verdict": "as stated", "words": "x and y swapped <i>"}
+    event = {"event": "imu-axes", "stream": "imu", "verdict": "as stated", "words": "x and y swapped <i>"}
     with (copy / "events.jsonl").open("a") as stream:
-        stream.write(json.dumps(said) + "\n")
+        stream.write(json.dumps(event) + "\n")
     assert not [t for _, t in read(copy).verdict if "swapped" in t]
     with (copy / "events.jsonl").open("a") as stream:
-        stream.write(json.dumps(said | {"verdict": "wrong"}) + "\n")
+        stream.write(json.dumps(event | {"verdict": "wrong"}) + "\n")
     assert ("bad", "IMU imu: x and y swapped <i>") in read(copy).verdict
 
 
@@ -312,16 +312,16 @@ def test_text_of_files_is_escaped(copy: Path) -> None:
 def test_the_command_line(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = (copy / PAGE).read_bytes()
     (copy / PAGE).unlink()
-    said = CliRunner().invoke(app, ["report", str(copy)])
-    assert said.exit_code == 0, said.output
-    assert str(copy / PAGE) in said.stdout
+    done = CliRunner().invoke(app, ["report", str(copy)])
+    assert done.exit_code == 0, done.output
+    assert str(copy / PAGE) in done.stdout
     assert (copy / PAGE).read_bytes() == before
     (copy / "current" / "ledger.csv").unlink()
     out = tmp_path / "page.html"
-    told = json.loads(CliRunner().invoke(app, ["report", str(copy), "--out", str(out), "--json"]).stdout)
-    assert told["page"] == str(out)
-    assert told["bytes"] == out.stat().st_size
-    assert list(told["missing"]) == ["ledger.csv"]
+    printed = json.loads(CliRunner().invoke(app, ["report", str(copy), "--out", str(out), "--json"]).stdout)
+    assert printed["page"] == str(out)
+    assert printed["bytes"] == out.stat().st_size
+    assert list(printed["missing"]) == ["ledger.csv"]
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", lambda url: bool(opened.append(url)) or True)
     assert CliRunner().invoke(app, ["report", str(copy), "--open"]).exit_code == 0

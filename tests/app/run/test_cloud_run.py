@@ -67,14 +67,14 @@ def finished(go: Callable[..., Run], tmp_path_factory: pytest.TempPathFactory) -
 
 def assert_right(run: Run, log: SensorLog) -> int:
     """Every accepted loop is where the truth has it, within 3 σ; returns how many there are."""
-    taken = [e for e in run.events if e["event"] == "loop" and e["verdict"] == "accepted"]
+    accepted = [e for e in run.events if e["event"] == "loop" and e["verdict"] == "accepted"]
     assert log.truth is not None
-    for e in taken:
+    for e in accepted:
         x = log.truth.trajectory.interpolate(run.map.node_times[[e["i"], e["j"]]])
         r = SE3.log(SE3.between(SE3.between(x[0], x[1]), np.array(e["T_ij"])))
         assert r @ np.linalg.solve(np.array(e["covariance"]), r) < stats.chi2.ppf(0.9973, 6)
         assert e["gates"]["loose"] or np.linalg.norm(r[3:]) < 0.5  # along a corridor its σ says that it does not know
-    return len(taken)
+    return len(accepted)
 
 
 def test_loops_between_clouds_close_the_map(finished: Run, go: Callable[..., Run], log: SensorLog) -> None:
@@ -90,15 +90,15 @@ class Listener(Observer):
     """Submaps in the graph and loops accepted, in the order in which they came."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.calls: list[Any] = []
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
-        self.told.append(submap.key)
+        self.calls.append(submap.key)
 
     def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
         if decision.verdict == "accepted":
             assert decision.factor_id in graph.records
-            self.told.append((decision.submap_i, decision.submap_j))
+            self.calls.append((decision.submap_i, decision.submap_j))
 
 
 def test_loops_enter_while_the_run_goes_on(go: Callable[..., Run], log: SensorLog) -> None:
@@ -106,12 +106,12 @@ def test_loops_enter_while_the_run_goes_on(go: Callable[..., Run], log: SensorLo
     now = go(every=1, progress=[heard])
     end = go(every=0, progress=[late])
     last = [s.key for s in now.submaps][-1]
-    for n, x in enumerate(heard.told):
+    for n, x in enumerate(heard.calls):
         if isinstance(x, tuple):
-            assert set(x) <= set(heard.told[:n]) | {last}
-    first = next(n for n, x in enumerate(heard.told) if isinstance(x, tuple))
-    assert last in heard.told[first:], "no loop was there before the last submap"
-    assert last not in late.told[next(n for n, x in enumerate(late.told) if isinstance(x, tuple)) :]
+            assert set(x) <= set(heard.calls[:n]) | {last}
+    first = next(n for n, x in enumerate(heard.calls) if isinstance(x, tuple))
+    assert last in heard.calls[first:], "no loop was there before the last submap"
+    assert last not in late.calls[next(n for n, x in enumerate(late.calls) if isinstance(x, tuple)) :]
     assert assert_right(now, log) >= assert_right(end, log)
     assert now.metric("path_rmse_aligned") < 1.5 * end.metric("path_rmse_aligned")
 

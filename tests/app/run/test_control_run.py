@@ -65,10 +65,10 @@ def test_the_report_the_metrics_and_the_verdict(run):
     assert run.metric("check_nis_dof") == 28.0
     assert check["low"] < check["nis_per_dof"] < check["high"]
     assert 0.05 < check["power"] == run.metric("check_power")
-    said = {f.code: f.text for f in run.verdict}
-    assert "line 8: no landmark has this id; got l9999" in said["control-points-refused"]
-    assert "14 of 15 rows used — refused: line 16: sigma is not above 0; got -1" in said["check-points-refused"]
-    assert f"— {check['verdict']}:" in said["check-points"]
+    lines = {f.code: f.text for f in run.verdict}
+    assert "line 8: no landmark has this id; got l9999" in lines["control-points-refused"]
+    assert "14 of 15 rows used — refused: line 16: sigma is not above 0; got -1" in lines["check-points-refused"]
+    assert f"— {check['verdict']}:" in lines["check-points"]
     assert "RMSE at the check points" in run.headline.text or "ground truth" in run.headline.text
     assert set(run.ledger["stream"]) >= {f"control rows/{k}" for k in range(2, 8)}
     T = np.array(control["T_control_map"])
@@ -144,9 +144,9 @@ def test_a_refined_path_is_held_by_rows_at_times():
     assert run.refined is not None
     assert run.refined.refinement.fixes.used == 6
     assert run.map.T_gps_world is None
-    said = {f.code: f.text for f in run.verdict}
-    assert "6 of 7 rows hold the refined path" in said["control-points-refined"]
-    assert said["refine-fixes"].startswith("control points in the refinement: 6")
+    lines = {f.code: f.text for f in run.verdict}
+    assert "6 of 7 rows hold the refined path" in lines["control-points-refined"]
+    assert lines["refine-fixes"].startswith("control points in the refinement: 6")
     check = run.report["check_points"]
     assert (check["aligned"], check["dof"]) == (4, 32.0)
     assert check["low"] < check["nis_per_dof"] < check["high"]

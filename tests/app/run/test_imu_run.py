@@ -108,9 +108,9 @@ def test_a_gap_in_the_readings_is_counted_and_bridged_by_the_submaps(every, monk
     bare = solved(log, submaps, monkeypatch)
     assert not [f for f in r.verdict if f.level == "bad"]
     assert r.metric("path_rmse_aligned") < bare.metric("path_rmse_aligned")
-    (said,) = [e for e in r.events if e["event"] == "imu"]
-    assert 0 < sum(said["dropped"].values()) < 10
-    assert 15 < said["ways"] < 24
+    (event,) = [e for e in r.events if e["event"] == "imu"]
+    assert 0 < sum(event["dropped"].values()) < 10
+    assert 15 < event["ways"] < 24
 
 
 def test_what_the_front_end_used_is_not_used_again(monkeypatch):
@@ -138,7 +138,7 @@ def test_wrong_axes_are_named_while_the_run_goes_on(monkeypatch):
 def test_a_contradiction_is_reported(monkeypatch, caplog):
     """Submaps that say to be a hundred times as sure as they are."""
     log, submaps = made()
-    sure = [
+    overconfident = [
         replace(
             s,
             exit_covariance=1e-4 * s.exit_covariance,
@@ -146,9 +146,9 @@ def test_a_contradiction_is_reported(monkeypatch, caplog):
         )
         for s in submaps
     ]
-    r = solved(log, sure, monkeypatch, config={"imu": {"use": "auto"}})
-    (said,) = [e for e in r.events if e["event"] == "imu-contradicted"]
-    assert said["chi2_per_dof"] > said["high"] > 1
+    r = solved(log, overconfident, monkeypatch, config={"imu": {"use": "auto"}})
+    (event,) = [e for e in r.events if e["event"] == "imu-contradicted"]
+    assert event["chi2_per_dof"] > event["high"] > 1
     assert "contradict each other" in caplog.text
 
 
@@ -157,11 +157,11 @@ def test_options_of_the_factors_are_options_of_a_run(monkeypatch):
     thinned = replace(log, streams={"imu": log["imu"].take(slice(None, None, 3))})
     between = float(np.median(np.diff(thinned["imu"].times)))
     r = solved(thinned, submaps, monkeypatch, config={"imu": {"use": "auto", "pause": 0.5 * between}})
-    (said,) = [e for e in r.events if e["event"] == "imu"]
-    assert any("pause" in reason for reason in said["dropped"])
+    (event,) = [e for e in r.events if e["event"] == "imu"]
+    assert any("pause" in reason for reason in event["dropped"])
     r = solved(thinned, submaps, monkeypatch, config={"imu": {"use": "auto", "pause": 2.0 * between}})
-    (said,) = [e for e in r.events if e["event"] == "imu"]
-    assert not any("pause" in reason for reason in said["dropped"])
+    (event,) = [e for e in r.events if e["event"] == "imu"]
+    assert not any("pause" in reason for reason in event["dropped"])
 
 
 @pytest.mark.parametrize("gravity", [False, True], ids=["planar", "three axes"])
@@ -185,9 +185,9 @@ def test_wheels_and_an_imu_in_the_plane(gravity):
     both = replace(log, streams={**log.streams, "imu": imu})
     r = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False, config={"imu": {"use": "auto"}})
     bare = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False)
-    (said,) = [e for e in r.events if e["event"] == "imu"]
-    assert said["ways"] == len(r.graph.submaps)
-    assert not said["dropped"]
+    (event,) = [e for e in r.events if e["event"] == "imu"]
+    assert event["ways"] == len(r.graph.submaps)
+    assert not event["dropped"]
     assert r.metric("imu_gyro_bias") == pytest.approx(2e-3, abs=4 * r.metric("imu_gyro_bias_sigma"))
     assert r.metric("imu_gyro_bias_sigma") < 1e-3
     assert r.metric("converged") == 1.0

@@ -97,19 +97,19 @@ def test_a_loop_can_be_undone(finished: tuple) -> None:
     """At the end of a run made again from the same submaps; what else was decided stays."""
     with_all = finished[0]
     accepted = [d.loop for d in ledger_of_events(with_all.graph.events).current() if d.verdict == "accepted"]
-    gone = accepted[0]
+    undone = accepted[0]
     back = BackEnd(BackEndConfig(loops=True), "batch")
     for s in with_all.submaps:
         back.add(s)
-    back.finish([gone])
+    back.finish([undone])
     ledger = ledger_of_events(back.graph.events)
-    assert (ledger.of(gone).verdict, ledger.of(gone).why) == ("undone", "asked for")
+    assert (ledger.of(undone).verdict, ledger.of(undone).why) == ("undone", "asked for")
     assert [d.loop for d in ledger.current() if d.verdict == "accepted"] == accepted[1:]
     factors = [r for r in back.graph.records.values() if r.group == "loop"]
     assert len(factors) == len(accepted) - 1
     assert np.abs(back.graph.values.poses - with_all.graph.values.poses).max() > 1e-4
     with pytest.raises(DataError):
-        back.undo_loop(gone)
+        back.undo_loop(undone)
     with pytest.raises(DataError):
         back.undo_loop(999)
 
@@ -151,16 +151,16 @@ def test_the_command_lists_them(folder: Path) -> None:
     ledger = loops_of_run(folder)
     result = CliRunner().invoke(app, ["loops", str(folder), "--json"])
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["counts"] == ledger.counts()
-    assert len(told["loops"]) == len(ledger.current())
-    first = told["loops"][0]
+    printed = json.loads(result.stdout)
+    assert printed["counts"] == ledger.counts()
+    assert len(printed["loops"]) == len(ledger.current())
+    first = printed["loops"][0]
     assert {"loop", "verdict", "why", "source", "chi2", "weight", "effect", "factor_id"} <= set(first)
     text = CliRunner().invoke(app, ["loops", str(folder), "--all"]).stdout
     assert "accepted" in text
     assert text.count("\n") == len(ledger.current()) + 2
     history = json.loads(CliRunner().invoke(app, ["loops", str(folder), "--json", "--history"]).stdout)
-    assert len(history["loops"]) >= len(told["loops"])
+    assert len(history["loops"]) >= len(printed["loops"])
 
 
 def test_front_ends_matches_are_listed_too(tmp_path: Path) -> None:
@@ -174,12 +174,12 @@ def test_front_ends_matches_are_listed_too(tmp_path: Path) -> None:
     for x in (*submaps[:2], replace(s, matches=matches)):
         back.add(x)
     OutputFiles(tmp_path).write_lines("events.jsonl", back.graph.events)
-    taken, left = loops_of_run(tmp_path).current()
-    assert (taken.verdict, taken.source, taken.why, taken.submap_i, taken.submap_j) == (
+    used, left = loops_of_run(tmp_path).current()
+    assert (used.verdict, used.source, used.why, used.submap_i, used.submap_j) == (
         "accepted", "front-end", "support 0.90", 0, 2,
     )  # fmt: skip
     assert (left.verdict, left.why, left.factor_id) == ("rejected", "support 0.10 is too little", -1)
-    back.graph.remove(taken.factor_id, reason="wrong")
+    back.graph.remove(used.factor_id, reason="wrong")
     OutputFiles(tmp_path).write_lines("events.jsonl", back.graph.events)
     assert loops_of_run(tmp_path).current()[0].verdict == "undone"
 

@@ -161,16 +161,16 @@ def test_control_rows_hold_every_alternative_and_check_rows_test_the_chosen_one(
     config.write_text(config.read_text().replace("[run]\n", "\n".join(["[run]", *lines, ""]), 1))
     done = graphslam("map", folder, "--minimum-entropy", "--json")
     assert done.returncode == 0, done.stderr
-    said = {f["code"]: f["text"] for f in json.loads(done.stdout)["findings"]}
-    assert "4 rows used; their frame (survey)" in said["control-points"]
-    assert "m at 9 rows" in said["check-points"]
+    texts = {f["code"]: f["text"] for f in json.loads(done.stdout)["findings"]}
+    assert "4 rows used; their frame (survey)" in texts["control-points"]
+    assert "m at 9 rows" in texts["check-points"]
     assert json.loads((folder / "clearest.json").read_text())["findings"] == json.loads(done.stdout)["findings"]
     found = minimum_entropy_loops(*map_of_folder(folder), progress=False)
     for j in found.choice.order:
         held = [r for r in j.alternative.graph.records.values() if isinstance(r, ControlRecord)]
         assert len(held) == 4
-    told = minimum_entropy_topology(read_run_folder(folder), 2, log=finished.log, progress=False)
-    assert {f.code for f in told.findings} >= {"control-points"}
+    ranked = minimum_entropy_topology(read_run_folder(folder), 2, log=finished.log, progress=False)
+    assert {f.code for f in ranked.findings} >= {"control-points"}
     with pytest.raises(MissingDataError, match="only its folder holds"):
         minimum_entropy_loops(
             replace(finished, folder=None, report={**finished.report, "control_points": {}}), found_map(finished)

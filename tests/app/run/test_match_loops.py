@@ -59,10 +59,10 @@ def test_they_are_decided_on_with_all_loops(drive: tuple[list[Submap], Array], s
     ledger = ledger_of_events(back.graph.events).current()
     front = {(d.submap_i, d.submap_j, d.verdict) for d in ledger if d.source == "front-end"}
     assert front == {(0, 2, "accepted"), (0, 1, "rejected")}
-    ties = [d for d in ledger if d.source == "tie"]
-    assert ties
-    assert all(d.verdict == "accepted" for d in ties)
-    assert {(d.submap_i, d.submap_j) for d in ties} == {(0, 2)}
+    overlaps = [d for d in ledger if d.source == "tie"]
+    assert overlaps
+    assert all(d.verdict == "accepted" for d in overlaps)
+    assert {(d.submap_i, d.submap_j) for d in overlaps} == {(0, 2)}
     end = se3.se3_between(bases[0], bases[2])
     off = [np.linalg.norm(b.graph.values.poses[b.graph.submaps[2].node][:3] - end[:3]) for b in (trusting, back)]
     assert off[1] < 0.2
@@ -85,9 +85,9 @@ def test_a_match_is_undone_with_its_ties(
     asked: list[LoopDecision] = []
     monkeypatch.setattr(app_loops, "loops_of_run", lambda folder: ledger_of_events(back.graph.events))
     monkeypatch.setattr(app_loops, "removed_loops_of_run", lambda folder: undone)
-    monkeypatch.setattr(app_loops, "rerun_without_loops", lambda folder, gone, progress: asked.extend(gone))
+    monkeypatch.setattr(app_loops, "rerun_without_loops", lambda folder, numbers, progress: asked.extend(numbers))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
-    tie = next(d.loop for d in undone if d.source == "tie")
-    app_loops.redo_loop(tmp_path, tie)
-    assert {d.loop for d in asked} == {d.loop for d in undone} - {tie}
+    overlap = next(d.loop for d in undone if d.source == "tie")
+    app_loops.redo_loop(tmp_path, overlap)
+    assert {d.loop for d in asked} == {d.loop for d in undone} - {overlap}

@@ -317,8 +317,8 @@ def test_two_refined_sessions_are_merged_by_their_refined_submaps(finished: Run,
     groups = {e["group"] for e in both.graph.events if e.get("event") == "between"}
     assert groups == {"session"}
     t = both.graph.ledger.table()
-    ties = t[t["stream"].str.endswith("/scan")]
-    assert set(ties["kind"]) == {"shared-scan"}
+    scans = t[t["stream"].str.endswith("/scan")]
+    assert set(scans["kind"]) == {"shared-scan"}
     assert [s["refined"] for s in both.report["sessions"]] == [True, True]
     found = localise(finished, refined_submaps_of(other)[:2])
     assert found.found, found.why

@@ -56,10 +56,10 @@ def test_text_json_and_report_say_the_same(run: Run) -> None:
     for f in lines:
         assert f.text in text
         assert f.text in shown
-    said = headline_of_json(stored)
-    assert said == run.headline == gs.open_run(run.folder).headline
-    assert text.count(f"verdict: {said.text}") == 1
-    assert (page.headline, page.text.count(said.text)) == (said.text, 1)
+    headline = headline_of_json(stored)
+    assert headline == run.headline == gs.open_run(run.folder).headline
+    assert text.count(f"verdict: {headline.text}") == 1
+    assert (page.headline, page.text.count(headline.text)) == (headline.text, 1)
 
 
 def test_every_stream_is_counted(run: Run) -> None:
@@ -125,7 +125,7 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
     seen = [*itertools.product(("good", "look", "bad"), ("passes", "calibration", "gps-not-used", "new-one"))]
     one = [[Finding(level, code, "x.")] for level, code in seen]
     extra = [[], *one, one[1] + one[6], one[4] + one[9]]
-    said = set()
+    headlines = set()
     every = itertools.product((True, False), RATIOS, RATIOS, (None, 1.0, 1.8), (None, 0.0, 0.3, 1.0, 2.0))
     for converged, chi2, nees, loops, own in every:
         figs = figures(converged, chi2, nees, loops, own)
@@ -163,8 +163,8 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
                 assert level == "look" or do not in (CONSERVATIVE, SMALL_RESIDUALS)
             else:
                 assert do in (NOTHING, NOTHING_KNOWN)
-            said.add(first.text)
-    assert len(said) > 300
+            headlines.add(first.text)
+    assert len(headlines) > 300
 
 
 def test_the_first_line_says_what_was_made_and_what_to_do() -> None:

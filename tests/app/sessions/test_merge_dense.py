@@ -269,16 +269,16 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     found = two.find(InterSessionConfig())
     shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
     wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
-    for ties, named in ((wrong, r"b: \d+ loop closures with a agree .* looks alike"), (found, "")):
+    for loops, named in ((wrong, r"b: \d+ loop closures with a agree .* looks alike"), (found, "")):
         graph = FactorGraph(3)
         solver = make_solver("batch", graph)
         add_session(graph, known)
         solver.solve_to_optimum()
         if named:
             with pytest.raises(SolverError, match=named):
-                connect_session(graph, solver, known, 0, new, found=(two, ties), config=InterSessionConfig(heard=1))
+                connect_session(graph, solver, known, 0, new, found=(two, loops), config=InterSessionConfig(heard=1))
         else:
-            assert len(connect_session(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
+            assert len(connect_session(graph, solver, known, 0, new, found=(two, loops)).used) >= 2
 
 
 def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:

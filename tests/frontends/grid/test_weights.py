@@ -40,20 +40,20 @@ def test_only_maps_that_know_enough_are_asked_or_else_the_oldest() -> None:
 def test_the_young_keep_their_share_of_the_weight(rng: np.random.Generator) -> None:
     log_weights = np.log(rng.dirichlet(np.ones(9)))
     gains = rng.normal(scale=5.0, size=9)
-    told = np.array([True, False, True, True, False, True, True, True, False])
-    new = fill_with_mean_likelihood(gains, log_weights, told)
-    assert np.array_equal(new[told], gains[told])
-    assert np.ptp(new[~told]) == 0.0
+    known = np.array([True, False, True, True, False, True, True, True, False])
+    new = fill_with_mean_likelihood(gains, log_weights, known)
+    assert np.array_equal(new[known], gains[known])
+    assert np.ptp(new[~known]) == 0.0
     before, after = np.exp(log_weights), normalise_log_weights(log_weights + new)
-    assert after[~told].sum() == pytest.approx(before[~told].sum(), rel=1e-12)
-    assert after[~told] / before[~told] == pytest.approx(np.ones(3), rel=1e-12)
+    assert after[~known].sum() == pytest.approx(before[~known].sum(), rel=1e-12)
+    assert after[~known] / before[~known] == pytest.approx(np.ones(3), rel=1e-12)
     # among themselves those told weigh as if the others were not there
-    assert after[told] / after[told].sum() == pytest.approx(
-        normalise_log_weights(log_weights[told] + gains[told]), rel=1e-12
+    assert after[known] / after[known].sum() == pytest.approx(
+        normalise_log_weights(log_weights[known] + gains[known]), rel=1e-12
     )
     assert np.array_equal(fill_with_mean_likelihood(gains, log_weights, np.zeros(9, dtype=np.bool_)), np.zeros(9))
     assert np.array_equal(fill_with_mean_likelihood(gains, log_weights, np.ones(9, dtype=np.bool_)), gains)
-    far = fill_with_mean_likelihood(gains - 1e6, log_weights, told)
+    far = fill_with_mean_likelihood(gains - 1e6, log_weights, known)
     assert np.all(np.isfinite(far))
 
 

@@ -269,11 +269,11 @@ def test_a_landmark_in_the_wrong_mirror_is_put_right():
     problem, poses = drive(path)
     wrong = problem.smooth(poses, mirrored(BEACON, path[0], path[-1])[None])
     assert np.hypot(*(wrong.gaussian.mean[3:] - BEACON)) > 5
-    settled = resolve_mirror_ambiguity(problem, wrong, DelayedInitialisation())
-    assert (settled.swapped, settled.ambiguous) == (1, 0)
-    assert settled.smoothed.chi2 < wrong.chi2 - 16
+    resolved = resolve_mirror_ambiguity(problem, wrong, DelayedInitialisation())
+    assert (resolved.swapped, resolved.ambiguous) == (1, 0)
+    assert resolved.smoothed.chi2 < wrong.chi2 - 16
     right = problem.smooth(poses, BEACON[None])
-    np.testing.assert_allclose(settled.smoothed.gaussian.mean, right.gaussian.mean, atol=1e-3)
+    np.testing.assert_allclose(resolved.smoothed.gaussian.mean, right.gaussian.mean, atol=1e-3)
     again = resolve_mirror_ambiguity(problem, right, DelayedInitialisation())
     assert again.swapped == again.ambiguous == again.vague == 0
     assert again.smoothed is right
@@ -281,11 +281,11 @@ def test_a_landmark_in_the_wrong_mirror_is_put_right():
 
 def test_a_landmark_that_cannot_be_distinguished_from_its_mirror_goes():
     problem, poses = drive(straight(30))
-    settled = resolve_mirror_ambiguity(problem, problem.smooth(poses, BEACON[None]), DelayedInitialisation())
-    assert settled.ambiguous == 1
-    assert len(settled.smoothed.gaussian.mean) == 3
-    assert not settled.smoothed.landmark_kept.any()
-    assert not settled.smoothed.kept.any()
+    resolved = resolve_mirror_ambiguity(problem, problem.smooth(poses, BEACON[None]), DelayedInitialisation())
+    assert resolved.ambiguous == 1
+    assert len(resolved.smoothed.gaussian.mean) == 3
+    assert not resolved.smoothed.landmark_kept.any()
+    assert not resolved.smoothed.kept.any()
 
 
 def test_a_landmark_that_the_free_path_leaves_vague_goes():

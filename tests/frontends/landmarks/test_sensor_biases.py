@@ -120,10 +120,10 @@ def erring(log, g):
     xi[:, :2] *= np.exp(g[1])
     bearings = wrap_angle(seen.bearings - g[3])
     # a sensor that stands elsewhere than it says: the log says it stands where it does less g
-    said = seen.T_base_sensor - np.array([g[4], g[5], 0.0])
+    mount = seen.T_base_sensor - np.array([g[4], g[5], 0.0])
     streams = {
         "odometry": replace(odometry, increments=se2_exp(xi)),
-        "landmarks": replace(seen, ranges=seen.ranges + g[2], bearings=bearings, T_base_sensor=said),
+        "landmarks": replace(seen, ranges=seen.ranges + g[2], bearings=bearings, T_base_sensor=mount),
     }
     return replace(log, streams=streams)
 

@@ -127,8 +127,8 @@ def test_maps_bend_where_bearings_are_vague_beside_ranges():
     args = (u, np.tile(Q, (len(truth), 1, 1)), k, j)
     exact = np.array([measure(truth[a], SENSOR, landmarks[b]) for a, b in zip(k, j)])
     vague = np.column_stack([exact, np.tile([0.02**2, 0.1**2], (len(k), 1))])
-    sure = np.column_stack([exact, np.tile([0.3**2, 0.01**2], (len(k), 1))])
-    maps = [SmoothingProblem(*args, v, SENSOR).smooth(truth, landmarks) for v in (vague, sure)]
+    precise = np.column_stack([exact, np.tile([0.3**2, 0.01**2], (len(k), 1))])
+    maps = [SmoothingProblem(*args, v, SENSOR).smooth(truth, landmarks) for v in (vague, precise)]
     per = [s.nonlinearity() / len(s.gaussian.mean) for s in maps]
     assert per[0] > MAX_NONLINEARITY
     assert per[1] < 0.01 * per[0]

@@ -47,15 +47,15 @@ def test_cells_are_those_of_the_plain_twin(made):
     alone = plain_cells(points, c.size, c.least, c.planes)[1]
     assert np.count_nonzero(np.abs(information - alone).max(axis=(1, 2)) > 0) > 10  # rows that surfaces are told of
     # the fast ones are told anew only every quarter of their points
-    told = level.cells.updated[: level.cells.used[0]] > 0
-    assert np.count_nonzero(told) == len(centres) == len(level)
+    valid = level.cells.updated[: level.cells.used[0]] > 0
+    assert np.count_nonzero(valid) == len(centres) == len(level)
     tree = cKDTree(centres)
     _, at = tree.query(level.centres)
     assert len(set(at)) == len(at)
-    full = level.cells.updated[: level.cells.used[0]][told] == level.cells.number[: level.cells.used[0]][told]
+    full = level.cells.updated[: level.cells.used[0]][valid] == level.cells.number[: level.cells.used[0]][valid]
     assert full.sum() > 10
     np.testing.assert_allclose(level.centres[full], centres[at[full]], atol=1e-12)
-    root = level.cells.root[: level.cells.used[0]][told][full]
+    root = level.cells.root[: level.cells.used[0]][valid][full]
     slow = information[at[full]]
     np.testing.assert_allclose(root.mT @ root, slow, rtol=1e-7, atol=1e-7 * np.abs(slow).max())
 
@@ -116,8 +116,8 @@ def test_normal_equations_are_those_of_the_plain_twin_and_of_differences(made):
             costs.append(plain_cost(body, se3.quat_to_matrix(moved[3:]), moved[:3], cells, A, SCALE))
         numeric[k] = (costs[0] - costs[1]) / 2e-6
     np.testing.assert_allclose(fit.g, numeric, rtol=1e-5, atol=1e-5 * np.abs(g).max())
-    told = np.linalg.norm(A, axis=(1, 2)) > 0
-    np.testing.assert_array_equal(level.known(np.ascontiguousarray(body @ R.T + t)), told & (at >= 0))
+    valid = np.linalg.norm(A, axis=(1, 2)) > 0
+    np.testing.assert_array_equal(level.known(np.ascontiguousarray(body @ R.T + t)), valid & (at >= 0))
     # what surfaces turned anyhow would say is no less, in any direction
     assert np.linalg.eigvalsh(fit.every - fit.H).min() > -1e-6 * np.abs(fit.every).max()
 

@@ -125,8 +125,8 @@ def test_lost_scans_are_a_line_of_the_verdict(log):
     offsets = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
     spoilt = type(clouds).from_arrays(clouds.times, np.concatenate(rows), offsets)
     submaps = list(FRONT.submaps(replace(log, streams={"clouds": spoilt}), seed=SeedTree(0)))
-    said = [f["code"] for a in submaps for f in a.report.get("findings", [])]
-    assert "scans-lost" in said
+    reported = [f["code"] for a in submaps for f in a.report.get("findings", [])]
+    assert "scans-lost" in reported
     assert sum(a.report["scan_states"].get("empty", 0) for a in submaps) == 6
     wide = max(np.sqrt(a.trajectory.covariances[:, 3, 3].max()) for a in submaps)
     assert wide > 10.0 * min(np.sqrt(a.exit_covariance[3, 3]) for a in submaps)

@@ -251,8 +251,8 @@ def test_a_wrong_unit_is_a_line_of_the_report(logs):
     log = logs[0].slice(0.0, 4.0)
     spoilt = replace(log, streams={**log.streams, "imu": wrong(log, "axes")})
     submaps = list(LidarFrontEnd().submaps(spoilt, seed=SeedTree(0)))
-    said = [f["code"] for s in submaps for f in s.report.get("findings", ())]
-    assert said.count("imu-left-aside") == len(submaps)
+    codes = [f["code"] for s in submaps for f in s.report.get("findings", ())]
+    assert codes.count("imu-left-aside") == len(submaps)
     assert all(s.assisting_streams == frozenset() for s in submaps)
 
 

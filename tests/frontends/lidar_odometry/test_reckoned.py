@@ -53,11 +53,11 @@ def test_it_is_of_use_while_it_tells_the_motions_of_scans(scale: float, useful: 
     assert reckoned.useful
     assert not reckoned.better
     for k in range(2, 40, 2):
-        told, _ = reckoned.motion(0.05 * k, 0.05 * (k + 2))
+        predicted, _ = reckoned.motion(0.05 * k, 0.05 * (k + 2))
         made = se3.se3_between(poses[k], poses[k + 2])
         even = made.copy()
         even[0] += 0.03  # what an even motion misses
-        reckoned.learn(told, made, even)
+        reckoned.learn(predicted, made, even)
     assert (reckoned.useful, reckoned.better) == (useful, better)
     turn, shift = reckoned.variances(np.zeros(2))
     assert turn == pytest.approx(NOISE[0] ** 2)

@@ -87,20 +87,20 @@ def test_a_record_of_odometry_over_a_gap_is_believed_only_if_it_tells_the_way() 
     whole = Odometry(times=t, increments=se2_exp(xi), covariances=covariances)
     keep = (t <= 20.0) | (t > 30.0)
     lost = whole.take(keep)
-    told = Odometry(times=lost.times, increments=lost.increments.copy(), covariances=lost.covariances)
-    told.increments[np.searchsorted(lost.times, 30.5)] = se2_exp(21 * xi[1])
+    full = Odometry(times=lost.times, increments=lost.increments.copy(), covariances=lost.covariances)
+    full.increments[np.searchsorted(lost.times, 30.5)] = se2_exp(21 * xi[1])
     times = np.arange(15.0, 35.0, 0.5)
-    for motion, speed in ((lost, 1.0), (told, 1.0)):
+    for motion, speed in ((lost, 1.0), (full, 1.0)):
         out, gaps = bridged(motion, times)
         assert gaps[0].speed == pytest.approx(speed, rel=0.01)
         assert np.sum(out.increments[1:, 0]) == pytest.approx(19.5, rel=0.02)
-    assert bridged(told, times)[1][0].speed_sigma == pytest.approx(0.2, rel=0.01)
+    assert bridged(full, times)[1][0].speed_sigma == pytest.approx(0.2, rel=0.01)
     # beyond the limit, only a record that gives the motion bridges; a body may have stopped meanwhile
     with pytest.raises(DataError, match=r"0\.50 m over it.*frontend\.longest_gap"):
         bridged(lost, times, limit=5.0)
-    assert bridged(told, times, limit=5.0)[1][0].speed == pytest.approx(1.0)
-    told.increments[np.searchsorted(lost.times, 30.5)] = [2.0, 0.0, 0.0]
-    out, gaps = bridged(told, times, limit=5.0)
+    assert bridged(full, times, limit=5.0)[1][0].speed == pytest.approx(1.0)
+    full.increments[np.searchsorted(lost.times, 30.5)] = [2.0, 0.0, 0.0]
+    out, gaps = bridged(full, times, limit=5.0)
     assert gaps[0].speed == pytest.approx(2.0 / 10.5)
     assert np.sum(out.increments[1:, 0]) == pytest.approx(2.0 + 0.5 * 18, rel=0.02)
     assert np.sqrt(out.covariances[1:, 0, 0].sum()) > 5.0  # as it drove on, or stopped

@@ -161,14 +161,14 @@ def test_bridges_cost_certainty(dim: int) -> None:
         covariances=o.covariances[keep],
     )
     drops = DropCounter()
-    sure, gaps = bridge_gap(gap, 5.0, where="odometry", drops=drops)
+    bridged, gaps = bridge_gap(gap, 5.0, where="odometry", drops=drops)
     np.testing.assert_allclose([gaps.begin[0], gaps.end[0]], gap.times[[29, 30]])
     assert drops.counts == {"odometry: gap bridged": 1}
-    changed = np.flatnonzero(np.any(sure.covariances != gap.covariances, axis=(1, 2)))
+    changed = np.flatnonzero(np.any(bridged.covariances != gap.covariances, axis=(1, 2)))
     np.testing.assert_array_equal(changed, [30])
     x = 0 if dim == 2 else 3
     metres = np.linalg.norm(log(gap.increments[30])[x : x + dim])
-    assert np.sqrt(sure.covariances[30, x, x]) == pytest.approx(0.2 * metres, rel=0.01)
+    assert np.sqrt(bridged.covariances[30, x, x]) == pytest.approx(0.2 * metres, rel=0.01)
     with pytest.raises(DataError, match=r"odometry: gap without records: 3\.200 s after record 29"):
         bridge_gap(o.take(keep), 3.0, where="odometry")
     assert bridge_gap(o, 1.0, where="odometry")[0] is not None
@@ -190,8 +190,8 @@ def test_a_pause_while_turning_on_the_spot_is_no_loss_of_records() -> None:
     increments[1:, 0], increments[1:, 2] = 1e-3, 0.1  # 5 mm/s
     increments[10] = [2e-3, 0.0, -0.38]
     o = Odometry(times=times, increments=increments, covariances=np.tile(1e-4 * np.eye(3), (20, 1, 1)))
-    sure, _ = bridge_gap(o, 20.0, where="odometry")
-    assert np.sqrt(sure.covariances[10, 2, 2]) == pytest.approx(np.hypot(0.01, 0.2 * 0.38), rel=0.02)
+    bridged, _ = bridge_gap(o, 20.0, where="odometry")
+    assert np.sqrt(bridged.covariances[10, 2, 2]) == pytest.approx(np.hypot(0.01, 0.2 * 0.38), rel=0.02)
     # the yaw rate of the other records does not come from two stamps that are 1 ms apart
     moving = replace(o, increments=increments * [100.0, 1.0, 1.0])
     lost = bridge_gap(moving, 20.0, where="odometry")[0].covariances[10, 2, 2]

@@ -201,9 +201,9 @@ def test_level_floors_tell_what_gravity_is_off_by(rng: np.random.Generator) -> N
     tilt[:90] += 0.08
     level = level_on_the_whole(tilt, increments)
     assert level is not None
-    taken = tilt - level
-    np.testing.assert_allclose(taken, np.broadcast_to(taken[0], taken.shape), atol=1e-15)  # one number each
-    np.testing.assert_allclose(taken[0], constant, atol=8e-4)
+    removed = tilt - level
+    np.testing.assert_allclose(removed, np.broadcast_to(removed[0], removed.shape), atol=1e-15)  # one number each
+    np.testing.assert_allclose(removed[0], constant, atol=8e-4)
     assert level_on_the_whole(None, increments) is None
     still = level_on_the_whole(tilt, np.tile([0.0, 0, 0, 0, 0, 0, 1], (600, 1)))
     assert still is not None

@@ -163,9 +163,9 @@ def test_lost_scans_are_a_line_of_the_verdict() -> None:
     made = list(
         scan_window_submaps(replace(steps, returns=returns), WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0))
     )
-    said = [f["code"] for s in made for f in s.report.get("findings", ())]
-    assert "scans-lost" in said
-    assert "motion-uncorrected" in said
+    codes = [f["code"] for s in made for f in s.report.get("findings", ())]
+    assert "scans-lost" in codes
+    assert "motion-uncorrected" in codes
     assert sum(s.report["scans_lost"] for s in made) >= 12
     assert all("lost" not in s.report["scans_lost_why"] for s in made)
     clean = list(scan_window_submaps(steps, WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0)))

@@ -262,8 +262,8 @@ def test_what_is_lost_is_reported_and_widens() -> None:
         assert {f.lost for f in made.found[40:55]} <= {*why, ""}
         assert sum(f.lost in why for f in made.found[40:55]) >= 12
         assert sum(f.lost in why for f in made.found[:40]) == 0
-        sure, lost = (errors(steps, m, 0, 54)[1] for m in (known, made))
-        assert np.all(np.diag(lost) > 1.5 * np.diag(sure))
+        followed, lost = (errors(steps, m, 0, 54)[1] for m in (known, made))
+        assert np.all(np.diag(lost) > 1.5 * np.diag(followed))
         e, C = errors(steps, made, 0, n - 1)
         assert e @ np.linalg.solve(C, e) < chi2_quantile(0.9999, 3)
 

@@ -148,9 +148,9 @@ def test_gps_fixes_hold_the_datum(rng):
     g.add_sensor(table(rows))
     g.finish_sensors()
     assert len(control_records(g)) == 2
-    said = [e for e in g.events if e["event"] == "control-refused"]
-    assert [e["line"] for e in said] == [4, 5]
-    assert said[0]["why"] == "GPS fixes hold the datum; got survey; wanted coordinates in the frame gps"
+    refused = [e for e in g.events if e["event"] == "control-refused"]
+    assert [e["line"] for e in refused] == [4, 5]
+    assert refused[0]["why"] == "GPS fixes hold the datum; got survey; wanted coordinates in the frame gps"
     BatchSolver(g).solve_to_optimum()
     T = BatchSolver(g).solution().T_gps_world
     np.testing.assert_allclose(T[:2], T_SURVEY_WORLD[:2], atol=0.3)
@@ -164,13 +164,13 @@ def test_rows_that_the_map_cannot_use(rng):
         return [*found, *surveyed([("l3", chain.landmarks[3])], rng, SIGMA, frame="gps")]
 
     g = planar(rng, rows)
-    said = {e["line"]: e["why"] for e in g.events if e["event"] == "control-refused"}
+    reasons = {e["line"]: e["why"] for e in g.events if e["event"] == "control-refused"}
     assert len(control_records(g)) == 2
-    assert said[4] == "no landmark has this id; got l99; wanted an id of landmarks.csv"
-    assert said[5] == "the time is outside the map; got -1.000 s; wanted 0.000 to 140.000 s"
-    assert said[6].startswith("the time is outside the map; got 999.000 s")
-    assert said[7].startswith("both places are at one node")
-    assert said[8] == "rows of one frame hold the datum; got gps; wanted coordinates in the frame survey"
+    assert reasons[4] == "no landmark has this id; got l99; wanted an id of landmarks.csv"
+    assert reasons[5] == "the time is outside the map; got -1.000 s; wanted 0.000 to 140.000 s"
+    assert reasons[6].startswith("the time is outside the map; got 999.000 s")
+    assert reasons[7].startswith("both places are at one node")
+    assert reasons[8] == "rows of one frame hold the datum; got gps; wanted coordinates in the frame survey"
     one = planar(rng, lambda chain: surveyed([("l1", chain.landmarks[1])], rng, SIGMA))
     assert not control_records(one)
     assert "do not span enough" in one.events[-1]["why"]

@@ -70,8 +70,8 @@ def test_heights_pull_less_than_the_plane(rng):
     gps = fixes_along(chain, rng, level_datum_pose(DATUM), sigma=0.05)
     wrong = gps.positions + np.column_stack([np.zeros((len(gps.times), 2)), 3.0 * rng.standard_normal(len(gps.times))])
     even = replace(gps, positions=wrong, sigma=np.full(len(wrong), 0.05))
-    told = Gps.upright(times=gps.times, positions=wrong, horizontal=0.05, vertical=3.0, lever=LEVER)
-    graphs = [built(chain, z, SOON) for z in (even, told)]
+    weighted = Gps.upright(times=gps.times, positions=wrong, horizontal=0.05, vertical=3.0, lever=LEVER)
+    graphs = [built(chain, z, SOON) for z in (even, weighted)]
     for g in graphs:
         BatchSolver(g).solve_to_optimum()
     heights = [np.std((g.values.poses[[s.exit_node for s in g.submaps]] - chain.poses[1:])[:, 2]) for g in graphs]

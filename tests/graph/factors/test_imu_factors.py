@@ -328,8 +328,8 @@ def test_swapped_axes_are_named(rng):
         g.add_sensor(swapped)
     assert len(g.records) == size
     g.add_sensor(swapped, config=ImuConfig(axes="warn"))
-    said = [e for e in g.events if e["event"] == "imu-axes"]
-    assert [e["verdict"] for e in said] == ["wrong", "wrong"]
+    events = [e for e in g.events if e["event"] == "imu-axes"]
+    assert [e["verdict"] for e in events] == ["wrong", "wrong"]
     right = chain(made)
     right.add_sensor(made.imu)
     assert [e["verdict"] for e in right.events if e["event"] == "imu-axes"] == ["as stated"]

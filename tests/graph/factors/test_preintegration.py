@@ -127,8 +127,8 @@ def test_what_it_refuses(rng):
         preintegrate(replace(imu, noise=replace(NOISE, gyro=0.0)), [0.1], [0.5])
     with pytest.raises(DataError, match="time does not increase at record 2"):
         replace(imu.take(slice(0, 3)), times=[0.0, 1.0, 0.5])
-    sure = preintegrate(replace(imu, noise=replace(NOISE, gyro_walk=0.0, gyro_bias=0.0)), [0.1], [0.9])
-    assert np.linalg.eigvalsh(sure.covariance[0]).min() > 0
+    fixed = preintegrate(replace(imu, noise=replace(NOISE, gyro_walk=0.0, gyro_bias=0.0)), [0.1], [0.9])
+    assert np.linalg.eigvalsh(fixed.covariance[0]).min() > 0
 
 
 def test_pauses():

@@ -92,9 +92,9 @@ def test_one_start_by_default_and_all_on_request_or_on_doubt(rng: np.random.Gene
     assert one.objective == pytest.approx(every.objective, rel=1e-8)
     assert [s.name for s in solve_network(net, starts=["tree"]).starts] == ["tree"]
     marked, _, _ = random_network(rng, 2, marks="bearing-range")
-    said = solve_network(marked)
-    assert "landmarks" in said.details["doubt"]
-    assert len(said.starts) > 1
+    doubtful = solve_network(marked)
+    assert "landmarks" in doubtful.details["doubt"]
+    assert len(doubtful.starts) > 1
 
 
 def test_doubt_that_a_certificate_settles_needs_no_other_start(
@@ -102,9 +102,9 @@ def test_doubt_that_a_certificate_settles_needs_no_other_start(
 ) -> None:
     net = grid_world(120, rng, share=0.8)
     quiet = replace(net, information=20.0 * net.information)  # the same answer, with noise stated too small
-    said = solve_network(quiet)
-    assert "degrees of freedom" in said.details["doubt"]
-    assert [s.name for s in said.starts] == ["chordal"]
+    doubtful = solve_network(quiet)
+    assert "degrees of freedom" in doubtful.details["doubt"]
+    assert [s.name for s in doubtful.starts] == ["chordal"]
     monkeypatch.setattr(solving, "_certified", lambda network, end: False)
     assert len(solve_network(quiet).starts) > 1
 
