@@ -30,9 +30,9 @@ def own_evidence_of(
     Parameters
     ----------
     chain : sequence of int
-        The segments, as passed to `settle`.
+        The segments, as passed to `submaps_of_segments`.
     submaps : sequence of Submap
-        As returned by `settle`, with grids.
+        As returned by it, with grids.
     """
     if len(chain) != len(submaps):
         raise DataError("segments and submaps differ in number", got=len(submaps), wanted=len(chain))

@@ -55,15 +55,15 @@ def test_cycles_equal_the_brute_force_twin_in_every_order_of_ends(rng: np.random
     chain = OdometryChain.of(z, Q)
     loops = LoopArrays.of(chain, ENDS, T, P)
     # turned loops are the same measurements
-    one_way = [
+    forward = [
         (int(a), int(b), m, c) for (a, b), m, c in zip(loops.ends, loops.measured, loops.covariance, strict=True)
     ]
     i, j = np.triu_indices(len(ENDS), 1)
     if dim == 3:
         i, j = i[::2], j[::2]
-    slow = [cycle_chi2(z, Q, one_way[a], one_way[b]) for a, b in zip(i, j, strict=True)]
+    slow = [cycle_chi2(z, Q, forward[a], forward[b]) for a, b in zip(i, j, strict=True)]
     assert pair_chi2(chain, loops, i, j) == pytest.approx(slow, rel=0.02, abs=1e-6)
-    alone = [cycle_chi2(z, Q, loop, None) for loop in one_way]
+    alone = [cycle_chi2(z, Q, loop, None) for loop in forward]
     assert chain_chi2(chain, loops) == pytest.approx(alone, rel=0.02)
     # a loop said backwards is the same loop, to the order of the linearisation
     ad_free = LoopArrays.of(

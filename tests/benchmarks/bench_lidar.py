@@ -50,7 +50,7 @@ def followed(
     """Path ``(n, 7)``, NEES/6 of its pieces, and a line of figures."""
     clouds.cloud(0)  # decoded
     odometry = odometry or start_odometry(clouds, LidarOdometryConfig(), imu)
-    poses, states, nees, begin, way, spent = [], Counter[str](), [], 0, 0.0, 0.0
+    poses, states, nees, begin, length, spent = [], Counter[str](), [], 0, 0.0, 0.0
     for k in range(min(len(clouds), scans)):
         cloud, ages = clouds.cloud(k), clouds.ages(k)
         if k == 5:
@@ -59,13 +59,13 @@ def followed(
         poses.append(odometry.pose)
         if k == 0:
             odometry.errors.begin()
-        if truth is not None and odometry.length - way >= PIECE:
+        if truth is not None and odometry.length - length >= PIECE:
             a, b = poses[begin], poses[k]
             C = relative_covariance((a, b), (a, b), odometry.errors.joint)
             e = se3.se3_log(se3.se3_between(se3.se3_between(a, b), se3.se3_between(truth[begin], truth[k])))
             nees.append(float(e @ np.linalg.solve(C, e)) / 6.0)
             odometry.errors.begin()
-            begin, way = k, odometry.length
+            begin, length = k, odometry.length
     spent += time.process_time()
     path = np.array(poses)
     rate = float(np.median(np.diff(clouds.times)))

@@ -106,8 +106,8 @@ def drive(folder: Path, length: float, seed: int) -> None:
         rows = np.column_stack([clouds.cloud(k), np.ones(len(clouds.cloud(k)))])
         rows.astype(np.float32).tofile(folder / "velodyne" / f"{k:06d}.bin")
     np.savetxt(folder / "times.txt", clouds.times, fmt="%.6f")
-    way = np.linalg.norm(np.diff(log.truth.trajectory.positions, axis=0), axis=1).sum()
-    print(f"{len(clouds)} scans along {way:.0f} m")
+    driven = np.linalg.norm(np.diff(log.truth.trajectory.positions, axis=0), axis=1).sum()
+    print(f"{len(clouds)} scans along {driven:.0f} m")
 
 
 def main() -> None:
@@ -135,8 +135,8 @@ def main() -> None:
         start = time.process_time()
         run = gs.run(source, frontend=a.frontend, out=Path(folder) / "run", config=config, progress=False)
         spent, peak = time.process_time() - start, max(peaks.peak, resident()[1])
-        way = run.map.trajectory.length()
-        facts = f"{len(run.submaps)} submaps, {way:.0f} m: peak {peak / 1e3:.2f} GB, {spent:.0f} CPU s"
+        length = run.map.trajectory.length()
+        facts = f"{len(run.submaps)} submaps, {length:.0f} m: peak {peak / 1e3:.2f} GB, {spent:.0f} CPU s"
         print(f"{facts}; {SPILL_CACHE.filed / 1e6:.0f} MB on disk")
         print(run.headline.text)
     raise SystemExit(peak > 1e3 * a.limit)

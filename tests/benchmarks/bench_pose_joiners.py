@@ -42,7 +42,7 @@ def graphs(root: Path, names: list[str]) -> bool:
         file = f"posegraphs/{name}.g2o.xz"
         problem = JoinProblem.of_network(read_network(root / file), 50)
         count, most = TARGETS[name]
-        for way, join in WAYS.items():
+        for method, join in WAYS.items():
             join(problem.first_submaps(2))
             begin = time.process_time()
             own = join(problem)
@@ -50,16 +50,16 @@ def graphs(root: Path, names: list[str]) -> bool:
             best = optimise_estimate(problem, own)
             parts = f"{middle - begin:6.2f} {time.process_time() - middle:7.2f} {best.iterations:3d}"
             value = f"{own.objective:10.6g} {best.objective_polished:11.7g}"
-            print(f"{name:16} {len(problem.keys):7d} {way:9} {value} {parts}")
+            print(f"{name:16} {len(problem.keys):7d} {method:9} {value} {parts}")
             assert best.objective_polished is not None
             met &= len(problem.keys) == count and best.objective_polished < BEST_KNOWN[file] * (1 + 1e-6)
-            met &= way != "tree" or own.objective <= most
+            met &= method != "tree" or own.objective <= most
     return met
 
 
 def ramps(trials: int, noises: tuple[tuple[float, float], ...]) -> None:
     """Table of consistency on drawn ramps."""
-    rows = [("batch", 0), *((way, passes) for way in WAYS for passes in (1, 3))]
+    rows = [("batch", 0), *((method, passes) for method in WAYS for passes in (1, 3))]
     for metres, degrees in noises:
         nees: dict[tuple[str, int], list[float]] = {r: [] for r in rows}
         over: dict[tuple[str, int], list[float]] = {r: [] for r in rows}

@@ -87,8 +87,8 @@ def main() -> None:
     args = parser.parse_args()
     steps = tunnel_steps(300 if args.quick else args.scans)
     assert steps.truth is not None
-    seconds, way = steps.times[-1] - steps.times[0], steps.path_length[-1]
-    print(f"{len(steps)} steps, {seconds:.0f} s, {way:.0f} m, {args.particles} particles, 0.2 m")
+    seconds, length = steps.times[-1] - steps.times[0], steps.path_length[-1]
+    print(f"{len(steps)} steps, {seconds:.0f} s, {length:.0f} m, {args.particles} particles, 0.2 m")
     for beams in (0, 300):
         for threads in (1, 2):
             config = GridFilterConfig(particles=args.particles, map_beams=beams, threads=threads)

@@ -272,9 +272,9 @@ def chain_graph(poses: int, share: float) -> Any:
     R, p = world.truth
     R, p = R[0].T @ R, (p - p[0]) @ R[0]
 
-    def measured(i: Any, j: Any, turn: float, way: float) -> Any:
+    def measured(i: Any, j: Any, turn: float, shift: float) -> Any:
         Q = quat_to_matrix(so3_exp(turn * rng.standard_normal((len(i), 3))))
-        d = np.einsum("nji,nj->ni", R[i], p[j] - p[i]) + way * rng.standard_normal((len(i), 3))
+        d = np.einsum("nji,nj->ni", R[i], p[j] - p[i]) + shift * rng.standard_normal((len(i), 3))
         return R[i].swapaxes(1, 2) @ R[j] @ Q, d
 
     k, ends = np.arange(poses - 1), np.column_stack([j - per, j])

@@ -19,8 +19,8 @@ def scans(dim: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     """Origins, points in one frame, and from which origin each was seen, not in order."""
     origins = rng.uniform(-1.0, 1.0, (4, dim))
     scan = rng.integers(0, 4, 300)
-    way = rng.standard_normal((300, dim))
-    points = origins[scan] + way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(2.0, 6.0, (300, 1))
+    ray = rng.standard_normal((300, dim))
+    points = origins[scan] + ray / np.linalg.norm(ray, axis=1, keepdims=True) * rng.uniform(2.0, 6.0, (300, 1))
     return origins, points, scan
 
 

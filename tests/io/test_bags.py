@@ -394,8 +394,8 @@ def test_clouds_in_the_frame_of_the_odometry_are_brought_to_the_base(tmp_path: P
 @pytest.mark.parametrize(("parent", "child"), [("r1/odom", "r1/base_link"), ("start", "hull")])
 def test_odometry_from_transforms_of_other_names(tmp_path: Path, parent: str, child: str) -> None:
     log = load_recording(written(tmp_path, "ros2", moving_world(Messages(), parent, child, "lidar")))
-    way = np.linalg.norm(log["odometry"].increments[1:, :3], axis=1).sum()
-    assert way == pytest.approx(0.3 * np.hypot(1, 0.1) * (N - 1), rel=1e-3)
+    length = np.linalg.norm(log["odometry"].increments[1:, :3], axis=1).sum()
+    assert length == pytest.approx(0.3 * np.hypot(1, 0.1) * (N - 1), rel=1e-3)
     assert log.meta["base_frame"] == child
     np.testing.assert_allclose(log["clouds"].T_base_sensor, MOUNT, atol=1e-6)
     with pytest.raises(ConfigError, match=f"moving transforms: {parent}"):

@@ -145,10 +145,10 @@ def test_the_turn_of_the_earth_while_a_signal_travels():
     plane = TangentPlane(52.5, 13.4, 80.0)
     sent = np.array([[1.45e7, 2.8e6, 2.18e7], [-5.9e6, -9.5e6, 2.29e7]])
     flat = plane.from_ecef(sent)
-    way = np.linalg.norm(sent - plane.origin, axis=1)
+    distance = np.linalg.norm(sent - plane.origin, axis=1)
     sagnac = EARTH_RATE / SPEED_OF_LIGHT * (sent[:, 0] * plane.origin[1] - sent[:, 1] * plane.origin[0])
     turned = plane.satellites(sent)
-    np.testing.assert_allclose(np.linalg.norm(turned, axis=1) - way, sagnac, atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1) - distance, sagnac, atol=2e-3)
     assert np.all(np.linalg.norm(turned - flat, axis=1) > 50.0)
 
 
@@ -182,5 +182,5 @@ def test_the_recorded_sets(data_dir):
     p = city["pseudoranges"]
     assert (len(p.times), len(p.ranges), len(city["reference"].times)) == (1372, 20038, 1372)
     assert [dict(log.dropped) for log in (flight, drive, city)] == [{}, {}, {}]
-    way = np.linalg.norm(np.diff(city["reference"].poses[:, :3], axis=0), axis=1).sum()
-    assert way == pytest.approx(1549, abs=1)
+    length = np.linalg.norm(np.diff(city["reference"].poses[:, :3], axis=0), axis=1).sum()
+    assert length == pytest.approx(1549, abs=1)

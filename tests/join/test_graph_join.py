@@ -83,8 +83,8 @@ def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
 
 def test_more_passes_come_nearer_to_the_optimum() -> None:
     problem, _ = pose_ramp(3, submaps=8, loops=40, radians=0.03)
-    for way in (join_graph_tree, join_graph_sequential):
-        once, thrice = way(problem), way(problem, passes=3)
+    for join in (join_graph_tree, join_graph_sequential):
+        once, thrice = join(problem), join(problem, passes=3)
         best = optimise_estimate(problem, once).objective_polished
         assert once.objective - best > 3 * (thrice.objective - best) > 0
 

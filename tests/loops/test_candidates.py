@@ -183,12 +183,12 @@ def test_gain_is_the_entropy_that_a_match_takes() -> None:
 
 
 def test_thinning_takes_the_best_first() -> None:
-    target, way = np.array([0, 0, 0, 1]), np.array([0.0, 5.0, 20.0, 1.0])
+    target, along = np.array([0, 0, 0, 1]), np.array([0.0, 5.0, 20.0, 1.0])
     score = np.array([1.0, 3.0, 2.0, 0.5])
-    assert thin_candidates(target, way, score, 10.0, 9) == [1, 2, 3]
-    assert thin_candidates(target, way, score, 10.0, 2) == [1, 2]
-    assert thin_candidates(target, way, score, 10.0, 9, [(0, 22.0)]) == [1, 3]
-    assert thin_candidates(target, way, score, 0.0, 9) == [1, 2, 0, 3]
+    assert thin_candidates(target, along, score, 10.0, 9) == [1, 2, 3]
+    assert thin_candidates(target, along, score, 10.0, 2) == [1, 2]
+    assert thin_candidates(target, along, score, 10.0, 9, [(0, 22.0)]) == [1, 3]
+    assert thin_candidates(target, along, score, 0.0, 9) == [1, 2, 0, 3]
 
 
 def with_matches(submaps: list[Submap], matches: dict[int, list[Match]], report: dict[int, dict]) -> list[Submap]:  # type: ignore[type-arg]

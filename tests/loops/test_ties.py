@@ -78,8 +78,8 @@ def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
         np.testing.assert_allclose(x.T_ij, g.between(a, b), atol=1e-12)
         sigma = [0.08, 0.08, 0.011] if dim == 2 else [0.011, 0.011, 0.011, 0.08, 0.08, 0.03]
         np.testing.assert_allclose(x.covariance, np.diag(np.square(sigma)))
-    ways = places.arc[[x.j for x in found]]
-    assert np.diff(ways).min() >= 6.0
+    arcs = places.arc[[x.j for x in found]]
+    assert np.diff(arcs).min() >= 6.0
     assert len(found) == 2
     assert not overlap_candidates(submaps, places, config=OverlapConfig(least_way=100.0))
 

@@ -115,9 +115,9 @@ def test_candidates_may_have_other_pieces(rng: np.random.Generator) -> None:
 
 def test_visiting_order_goes_to_the_nearest() -> None:
     sets = [frozenset(s) for s in ("abc", "xyz", "abd", "abe", "xyw")]
-    way = visiting_order(sets)
-    assert sorted(way) == list(range(5))
-    assert way[:3] == [0, 2, 3]
+    order = visiting_order(sets)
+    assert sorted(order) == list(range(5))
+    assert order[:3] == [0, 2, 3]
     assert visiting_order([frozenset()]) == [0]
 
 

@@ -305,8 +305,8 @@ def test_bands_end_where_beams_are_a_cell_apart() -> None:
         down = reach * depth / SENSOR.height  # from the edge to where the beam over it meets the ground below
         assert depth - math.tan(VEHICLE.max_slope) * down == pytest.approx(VEHICLE.climbable_step)
         speed = SENSOR.speed_bound(VEHICLE, depth)
-        way = speed * SENSOR.sweep_time + VEHICLE.braking_distance(speed) + 0.5 * VEHICLE.width
-        assert way == pytest.approx(reach)
+        distance = speed * SENSOR.sweep_time + VEHICLE.braking_distance(speed) + 0.5 * VEHICLE.width
+        assert distance == pytest.approx(reach)
     assert SENSOR.speed_bound(VEHICLE) == SENSOR.speed_bound(VEHICLE, VEHICLE.clearance)
     assert SENSOR.hole_reach(VEHICLE, 0.05) == SENSOR.speed_bound(VEHICLE, 0.05) == 0.0
     assert VEHICLE.braking_distance(VEHICLE.safe_speed(3.0)) == pytest.approx(3.0)
@@ -490,11 +490,11 @@ def test_ways_lead_round_hazards_and_never_through_them() -> None:
     wall[:, 3] = np.repeat(np.arange(-20, 4), 20)
     p.add(wall)
     costs = cost_map(p.classify(), VEHICLE)
-    way = plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
-    assert way is not None
-    off = np.hypot(way.points[:, 0] - 3.05, np.maximum(way.points[:, 1] - 0.35, 0.0))
+    path = plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
+    assert path is not None
+    off = np.hypot(path.points[:, 0] - 3.05, np.maximum(path.points[:, 1] - 0.35, 0.0))
     assert off.min() >= 0.5 * VEHICLE.width - 0.06
-    assert way.length == pytest.approx(np.sum(np.linalg.norm(np.diff(way.points, axis=0), axis=1)))
+    assert path.length == pytest.approx(np.sum(np.linalg.norm(np.diff(path.points, axis=0), axis=1)))
     assert plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
     with pytest.raises(DataError, match="outside the terrain map"):
         plan_vehicle_path(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))

@@ -51,16 +51,16 @@ def test_the_cut_goes_through_the_ramp() -> None:
 
 def test_pictures(rng: np.random.Generator) -> None:
     grid = scanned(rng, 3)
-    way = path([(-1, 0, 0), (1, 0, 0), (1, 1, 0)])
-    ax = plot_storey(grid, -0.5, 1.0, path=way, title="a storey")
+    driven = path([(-1, 0, 0), (1, 0, 0), (1, 1, 0)])
+    ax = plot_storey(grid, -0.5, 1.0, path=driven, title="a storey")
     assert np.isfinite(ax.lines[0].get_ydata()).all()
     plt.close(ax.figure)
-    ax = plot_storey(grid, -0.5, 1.0, path=way.transformed(np.array([0, 0, 5.0, 0, 0, 0, 1])))
+    ax = plot_storey(grid, -0.5, 1.0, path=driven.transformed(np.array([0, 0, 5.0, 0, 0, 0, 1])))
     assert not np.isfinite(ax.lines[0].get_ydata()).any()  # of another storey
     plt.close(ax.figure)
-    ax = plot_cut(grid, way)
+    ax = plot_cut(grid, driven)
     assert ax.get_xlabel() == "x [m]"
-    cloud, (_, at) = grid.occupied_cloud(), cut_plane(way)
+    cloud, (_, at) = grid.occupied_cloud(), cut_plane(driven)
     z = cloud[np.abs(cloud[:, 1] - at) < 1.0, 2]
     assert ax.get_ylim() == pytest.approx((z.min() - 0.5, z.max() + 0.5), abs=grid.voxel_size)
     plt.close(ax.figure)

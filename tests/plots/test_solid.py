@@ -22,8 +22,8 @@ def boxes() -> World:
     mesh.slab((-4.0, -4.0, 14.0, 4.0), 4.3, thickness=0.3)
     mesh.box((4.0, -2.0, 0.0), (6.0, -1.0, 3.0))
     v, t = mesh.build()
-    way = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
-    return World(name="boxes", vertices=v, triangles=t, waypoints=way, corner_radius=1.0, speed=1.0, meta={})
+    route = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    return World(name="boxes", vertices=v, triangles=t, waypoints=route, corner_radius=1.0, speed=1.0, meta={})
 
 
 def picture(ax: plt.Axes) -> tuple[np.ndarray, np.ndarray]:
@@ -87,11 +87,11 @@ def test_clouds_are_drawn_far_to_near_and_refused_if_broken() -> None:
     order = np.argsort(p @ view.axes[2])
     np.testing.assert_allclose(dots.get_offsets(), view.project(p)[order])
     np.testing.assert_allclose(dots.get_array(), p[order, 2])
-    way = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    line = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     own = rng.uniform(size=(50, 4))
-    both = plot_cloud(p, view=view, path=way, colours=own)
+    both = plot_cloud(p, view=view, path=line, colours=own)
     np.testing.assert_allclose(both.collections[0].get_facecolors(), own[order])
-    np.testing.assert_allclose(both.lines[-1].get_xydata(), view.project(way))
+    np.testing.assert_allclose(both.lines[-1].get_xydata(), view.project(line))
     with pytest.raises(DataError, match="colours"):
         plot_cloud(p, colours=own[:9])
     for bad in (np.zeros((0, 3)), np.zeros((3, 2)), np.full((2, 3), np.nan)):

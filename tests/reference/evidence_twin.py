@@ -268,10 +268,10 @@ class EvidenceTwin:
             if not self.inside(voxel):
                 return "left", float(t) * max_range, None
             if self.occupied(voxel):
-                ways_out = [
+                exits = [
                     (v + (y > x) - x) / (y - x) for x, y, v in zip(a.tolist(), b.tolist(), voxel) if x != y
                 ]  # parameters at which the ray passes the far face on each axis, also beyond its end
-                return "hit", min(max_range, 0.5 * (float(t) + min(ways_out)) * max_range), voxel
+                return "hit", min(max_range, 0.5 * (float(t) + min(exits)) * max_range), voxel
             if voxel not in self.values and not ignore_unknown:
                 return "unknown", float(t) * max_range, voxel
         return "max", max_range, None

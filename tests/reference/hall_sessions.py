@@ -34,7 +34,7 @@ class HallDrive:
 
 def hall_drive(
     world: BoxWorld,
-    way: Array,
+    path: Array,
     rng: np.random.Generator,
     *,
     per_submap: int = 27,
@@ -42,18 +42,18 @@ def hall_drive(
     clouds: bool = False,
 ) -> HallDrive:
     """A drive along true poses ``way (n, 7)``, one a second, in submaps of so many steps, with grids or clouds."""
-    times = start + np.arange(len(way), dtype=float)
+    times = start + np.arange(len(path), dtype=float)
     submaps = []
-    for k, a in enumerate(range(0, len(way) - 1, per_submap)):
-        b = min(a + per_submap, len(way) - 1)
+    for k, a in enumerate(range(0, len(path) - 1, per_submap)):
+        b = min(a + per_submap, len(path) - 1)
         local, P = [np.array([0.0, 0, 0, 0, 0, 0, 1])], [np.zeros((6, 6))]
-        for step in se3.se3_between(way[a:b], way[a + 1 : b + 1]):
+        for step in se3.se3_between(path[a:b], path[a + 1 : b + 1]):
             measured = se3.se3_compose(step, se3.se3_exp(STEP_SIGMA * rng.standard_normal(6)))
             A = se3.se3_adjoint(se3.se3_inverse(measured))
             local.append(se3.se3_compose(local[-1], measured))
             P.append(A @ P[-1] @ A.T + np.diag(STEP_SIGMA**2))
         make, kind = (clouded, "cloud") if clouds else (mapped, "grid")
-        seen = {kind: make(world, way[a : b + 1], rng, believed=np.stack(local))}
+        seen = {kind: make(world, path[a : b + 1], rng, believed=np.stack(local))}
         submaps.append(
             Submap(
                 key=k, interval=(times[a], times[b]), exit_pose=local[-1], exit_covariance=P[-1],
@@ -61,4 +61,4 @@ def hall_drive(
                 uses=frozenset({"scanner", "wheels"}), report={"ended": "test", "scans": b - a},
             )
         )  # fmt: skip
-    return HallDrive(submaps, Trajectory(times, way))
+    return HallDrive(submaps, Trajectory(times, path))

@@ -43,12 +43,12 @@ def hall(waypoints: Any = None, **changes: Any) -> World:
     ]
     things = [box([3, 3.5, 0], [4, 4.5, 1]), box([12, -5.5, 0.5], [13, -4.5, 2]), box([15.5, 2, 0.5], [16, 3, 1.5])]
     vertices, triangles = merge(shell, *floor, *things)
-    way = [[0, 0, 0], [6, 0, 0], [10, 0, 0.5], [14, 0, 0.5], [14, 2.5, 0.5], [10, 2.5, 0.5], [6, 2.5, 0], [1, 2.5, 0]]
+    route = [[0, 0, 0], [6, 0, 0], [10, 0, 0.5], [14, 0, 0.5], [14, 2.5, 0.5], [10, 2.5, 0.5], [6, 2.5, 0], [1, 2.5, 0]]
     given: dict[str, Any] = {"name": "hall", "corner_radius": 1.0, "speed": 0.75, "meta": {}}
     return World(
         vertices=vertices,
         triangles=triangles,
-        waypoints=way if waypoints is None else waypoints,
+        waypoints=route if waypoints is None else waypoints,
         **{**given, **changes},
     )
 

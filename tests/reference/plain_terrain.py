@@ -59,10 +59,10 @@ class PlainLine:
         for i in range(len(s)):
             stood = (place, height) if base is None else base[:2]
             before.append((*stood, slope, hidden))
-            way = s[i] - place
-            off = z[i] - (height + slope * way)
-            led = way > -0.05 and (way < 2.0 * f.memory or not any(on))
-            near = led and abs(off) < f.residual + f.residual_rate * max(way, 0.0)
+            ahead = s[i] - place
+            off = z[i] - (height + slope * ahead)
+            led = ahead > -0.05 and (ahead < 2.0 * f.memory or not any(on))
+            near = led and abs(off) < f.residual + f.residual_rate * max(ahead, 0.0)
             grown = False
             if near:
                 run = 0
@@ -85,7 +85,7 @@ class PlainLine:
                 anchor, slope, run = (s[first], z[first]), 0.0, 0
             unseen = not any(on)
             on[i] = 2 if grown else 1
-            if near and abs(way) < 0.03:
+            if near and abs(ahead) < 0.03:
                 continue
             if unseen and z[i] - self.foot > f.climb:
                 base = (s[i], self.foot, s[i])
@@ -177,9 +177,9 @@ class PlainLine:
                 window.append(j)
             if not window and k + 1 < len(low):
                 j = low[k + 1]
-                way = abs(s[j] - s[i])
-                if way < 2.0:
-                    self.say(0, max(round(100 * (abs(z[j] - z[i]) - f.slack * way)), 0), *middle(i, j))
+                gap = abs(s[j] - s[i])
+                if gap < 2.0:
+                    self.say(0, max(round(100 * (abs(z[j] - z[i]) - f.slack * gap)), 0), *middle(i, j))
             rises = [abs(z[j] - z[i]) - f.slack * abs(s[j] - s[i]) for j in window]
             if rises:
                 end = rises.index(max(rises))

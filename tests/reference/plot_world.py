@@ -82,11 +82,11 @@ def plot_world(
     return ax
 
 
-def _following_sections(world: World, way: Array, heights: tuple[float, ...], reach: float = 9.0) -> list[Array]:
+def _following_sections(world: World, path: Array, heights: tuple[float, ...], reach: float = 9.0) -> list[Array]:
     """Sections at many floor heights, each kept only where the nearest point of the way has that height."""
     step = 0.5
-    bins = np.round(way[:, 2] / step).astype(int)
-    tree = cKDTree(way[:, :2])
+    bins = np.round(path[:, 2] / step).astype(int)
+    tree = cKDTree(path[:, :2])
     found: list[list[Array]] = [[np.zeros((0, 2, 2))] for _ in heights]
     for b in np.unique(bins):
         for lines, height in zip(found, heights):

@@ -116,14 +116,14 @@ def corridor(seed, *, rest=0.0):
     rng = np.random.default_rng(seed)
     walls = np.array([[-40.0, y, 80.0, y] for y in (-1.1, 1.1)])
     x = np.linspace(0.0, 24.0, 150)
-    way = np.column_stack([x, 0.2 * np.sin(x / 4), np.arctan(0.05 * np.cos(x / 4))])
+    path = np.column_stack([x, 0.2 * np.sin(x / 4), np.arctan(0.05 * np.cos(x / 4))])
     still = int(rest / 0.3)
-    way = np.concatenate([np.repeat(way[:1], still, 0), way[:75], np.repeat(way[75:76], still, 0), way[75:]])
-    t, bearings = 0.3 * np.arange(len(way)), np.linspace(-np.pi / 2, np.pi / 2, 121)
-    ranges = np.array([scan(p, walls, bearings) for p in way])
+    path = np.concatenate([np.repeat(path[:1], still, 0), path[:75], np.repeat(path[75:76], still, 0), path[75:]])
+    t, bearings = 0.3 * np.arange(len(path)), np.linspace(-np.pi / 2, np.pi / 2, 121)
+    ranges = np.array([scan(p, walls, bearings) for p in path])
     ranges = np.where(ranges > 8.0, np.inf, ranges + 0.02 * rng.standard_normal(ranges.shape))
     xi = np.zeros((len(t), 3))
-    xi[1:] = se2_log(se2_between(way[:-1], way[1:]))
+    xi[1:] = se2_log(se2_between(path[:-1], path[1:]))
     d = np.hypot(xi[:, 0], xi[:, 1])
     sigma = np.sqrt(np.column_stack([9e-4 * d + 1e-6, np.full(len(d), 1e-6), 4e-4 * d + 2.5e-7]))
     xi[1:] += (sigma * rng.standard_normal(sigma.shape))[1:]
@@ -131,7 +131,7 @@ def corridor(seed, *, rest=0.0):
     scans = LaserScans(times=t, ranges=ranges, bearings=bearings, max_range=8.1)
     log = SensorLog(name="corridor", streams={"odometry": odometry, "scans": scans})
     steps = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
-    true = way[np.searchsorted(t, steps.times)]
+    true = path[np.searchsorted(t, steps.times)]
     return steps, chain_odometry(steps.odometry).poses, se2_between(np.broadcast_to(true[0], true.shape), true)
 
 

@@ -32,7 +32,7 @@ def pair(request: pytest.FixtureRequest) -> tuple[PreparedMap, PreparedMap, Arra
     world, rng = hall(cars=60), np.random.default_rng(5)
     there = straight_path(14.0, 44.0, 8.0)
     back = straight_path(40.0, 18.0, 10.0, yaw=np.pi) if request.param else straight_path(18.0, 40.0, 8.0)
-    target, source = (prepared(world, way, rng, origins=request.param) for way in (there, back))
+    target, source = (prepared(world, path, rng, origins=request.param) for path in (there, back))
     return target, source, se3.se3_compose(se3.se3_between(there[0], back[0]), PLACE)
 
 
@@ -80,8 +80,8 @@ def test_covariance_is_consistent_for_clouds_that_are_bent_inside() -> None:
     for seed in range(10):
         rng = np.random.default_rng(200 + seed)
         there, back = straight_path(14.0, 40.0, 8.0, step=2.0), straight_path(38.0, 18.0, 10.0, yaw=np.pi, step=2.0)
-        seen = [drifted(way, rng, 0.02, 2.5e-3) for way in (there, back)]
-        target, source = (prepared(world, way, rng, believed=at) for way, at in zip((there, back), seen))
+        seen = [drifted(path, rng, 0.02, 2.5e-3) for path in (there, back)]
+        target, source = (prepared(world, path, rng, believed=at) for path, at in zip((there, back), seen))
         k = 6
         place = se3.se3_between(seen[1][0], seen[1][k])
         near = int(np.argmin(np.linalg.norm(there[:, :3] - back[k, :3], axis=1)))

@@ -310,10 +310,10 @@ def test_drift_of_logs() -> None:
         turning = (imu.angular_rate[:, 1] * np.sin(roll) + imu.angular_rate[:, 2] * np.cos(roll)) / np.cos(pitch)
         yaw = np.cumsum(turning) / 50.0
         k = np.searchsorted(wheels.times, imu.times, side="right") - 1
-        way = np.cumsum(
+        path = np.cumsum(
             np.column_stack([np.cos(yaw), np.sin(yaw)]) * (wheels.speed[k] * np.cos(pitch) / 50.0)[:, None], 0
         )
-        miss = np.linalg.norm(way[-1] - log.truth.trajectory.positions[-1, :2])
+        miss = np.linalg.norm(path[-1] - log.truth.trajectory.positions[-1, :2])
         assert miss == pytest.approx(end, abs=0.35)
 
 

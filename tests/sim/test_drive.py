@@ -87,9 +87,9 @@ def test_nothing_jumps_and_pitch_takes_the_wheelbase_to_change(motion: RouteMoti
 
 
 def test_tight_corners_are_driven_slowly() -> None:
-    way = [[0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 3, 0]]
-    slow = drive_motion(hall(way, corner_radius=0.5), DriveConfig(most_turn_rate=0.4))
-    fast = drive_motion(hall(way, corner_radius=0.5), DriveConfig(most_turn_rate=5.0))
+    corners = [[0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 3, 0]]
+    slow = drive_motion(hall(corners, corner_radius=0.5), DriveConfig(most_turn_rate=0.4))
+    fast = drive_motion(hall(corners, corner_radius=0.5), DriveConfig(most_turn_rate=5.0))
     t = np.linspace(0, 1, 4000)
     turning = [np.abs(m.rotation(t * m.duration)[0][:, 2]).max() for m in (slow, fast)]
     assert 0.3 < turning[0] <= 0.401

@@ -18,9 +18,9 @@ from tests.sim.solid import Solid
 
 def solid(mesh: MeshBuilder) -> Solid:
     vertices, triangles = mesh.build()
-    way = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     return Solid(
-        World(name="test", vertices=vertices, triangles=triangles, waypoints=way, corner_radius=1.0, speed=1.0, meta={})
+        World(name="test", vertices=vertices, triangles=triangles, waypoints=xyz, corner_radius=1.0, speed=1.0, meta={})
     )
 
 
@@ -133,8 +133,8 @@ def test_section_is_that_of_every_triangle(height: float) -> None:
 
 
 def test_nothing_is_put_in_the_way() -> None:
-    way = [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (20.0, 15.0, 0.0)]
-    clear = KeepClear(plan_route(way, 2.0), margin=1.0)
+    corners = [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (20.0, 15.0, 0.0)]
+    clear = KeepClear(plan_route(corners, 2.0), margin=1.0)
     # 1.5 m off the way, half a metre thick: allowed; half a metre nearer: not; on another floor: anywhere
     assert clear.allows((10.0, 1.4), (6.0, 0.5), 0.0, 0.0)
     assert not clear.allows((10.0, 1.2), (6.0, 0.5), 0.0, 0.0)
@@ -149,7 +149,7 @@ def test_nothing_is_put_in_the_way() -> None:
     assert 50 < count < 190
     assert cars == 10  # the row that reaches to within a metre of the way stays empty
     s = solid(mesh)
-    route = plan_route(way, 2.0)
+    route = plan_route(corners, 2.0)
     p = route.positions(route.every(0.1))
     assert s.distance(p + [0.0, 0.0, 0.5]).min() > 0.95
     v, _ = mesh.build()
@@ -158,12 +158,12 @@ def test_nothing_is_put_in_the_way() -> None:
 
 
 def test_a_bay_more_changes_no_other_car() -> None:
-    way = plan_route([(0.0, 50.0, 0.0), (10.0, 50.0, 0.0)], 1.0)
+    route = plan_route([(0.0, 50.0, 0.0), (10.0, 50.0, 0.0)], 1.0)
     bays = np.array([(3.0 * k, 0.0, np.pi / 2) for k in range(8)])
     meshes = []
     for some in (bays, bays[:-1]):
         mesh = MeshBuilder()
-        park_cars(mesh, some, 0.0, 0.6, KeepClear(way), SeedTree(4).generator())
+        park_cars(mesh, some, 0.0, 0.6, KeepClear(route), SeedTree(4).generator())
         meshes.append(mesh.build()[0])
     assert np.array_equal(meshes[0][: len(meshes[1])], meshes[1])
 
@@ -171,14 +171,14 @@ def test_a_bay_more_changes_no_other_car() -> None:
 def test_revisits_of_a_known_way() -> None:
     """A square of 40 m driven one and a half times, and a way there and back beside it."""
     square = [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (40.0, 40.0, 0.0), (0.0, 40.0, 0.0), (0.0, 0.0, 0.0)]
-    way = plan_route([(-10.0, 0.0, 0.0), *square, (40.0, 0.0, 0.0), (40.0, 30.0, 0.0)], 1.5)
-    [found] = find_revisits(way)
+    route = plan_route([(-10.0, 0.0, 0.0), *square, (40.0, 0.0, 0.0), (40.0, 30.0, 0.0)], 1.5)
+    [found] = find_revisits(route)
     assert found["same_heading"]
-    a, b = way.positions(np.array(found["first"])), way.positions(np.array(found["again"]))
+    a, b = route.positions(np.array(found["first"])), route.positions(np.array(found["again"]))
     assert np.linalg.norm(a - b, axis=1).max() < 1.0
     lap = 160.0 - 4 * 1.5 * (2.0 - np.pi / 2)
     assert found["again"][0] - found["first"][0] == pytest.approx(lap, abs=1.5)
-    assert found["again"][1] == pytest.approx(way.length, abs=0.01)
+    assert found["again"][1] == pytest.approx(route.length, abs=0.01)
     there = [(0.0, 0.0, 0.0), (50.0, 0.0, 0.0), (50.0, 8.0, 0.0), (60.0, 8.0, 0.0), (60.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
     [back] = find_revisits(plan_route(there, 1.5), shortest=3.0)
     assert not back["same_heading"]

@@ -81,8 +81,8 @@ def test_twenty_seeds_are_twenty_places_with_loops_inside_and_outside() -> None:
         assert place.outside_by(place.trees[:, :2]).min() > 3.0
         apart = np.linalg.norm(points[:, None] - place.trees[:, :2], axis=2) - place.trees[:, 2]
         assert apart.min() > 1.2
-        way = np.column_stack([points, np.full(len(points), 0.5)])
-        assert place.caster.distances(way).min() > 0.3
+        path = np.column_stack([points, np.full(len(points), 0.5)])
+        assert place.caster.distances(path).min() > 0.3
 
 
 def test_records_without_noise_are_the_truth(exact: SensorLog) -> None:

@@ -67,8 +67,8 @@ def robot(config: CampusConfig = QUICK) -> SeedTree:
 def test_nothing_stands_in_the_way(preset: str, seed: int) -> None:
     world = campus(campus_preset(preset), seed=seed)
     route = world.route()
-    way = route.positions(route.every(0.3)) + [0.0, 0.0, 0.7]
-    assert RayCaster.of(world).distances(way).min() > 0.5
+    path = route.positions(route.every(0.3)) + [0.0, 0.0, 0.7]
+    assert RayCaster.of(world).distances(path).min() > 0.5
     assert world.meta["corridors"]
     assert len(world.meta["roofs"]) % 2 == 0
 
@@ -108,18 +108,18 @@ def test_indoor_is_under_a_ceiling(exact: SensorLog) -> None:
 
 def test_sessions_share_a_place_and_a_far_one_sees_nothing_of_it() -> None:
     base = campus_preset("three-blocks")
-    ways, meshes = [], []
+    paths, meshes = [], []
     for changes in ({}, {"session": 1}, {"far": True}):
         world = campus(dataclasses.replace(base, **changes), seed=2)
         route = world.route()
-        ways.append(route.positions(route.every(1.0))[:, :2])
+        paths.append(route.positions(route.every(1.0))[:, :2])
         meshes.append(world.vertices)
     for other in meshes[1:]:
         assert other.tobytes() == meshes[0].tobytes()
-    gap = [np.linalg.norm(ways[0][:, None] - w[None], axis=2) for w in ways[1:]]
+    gap = [np.linalg.norm(paths[0][:, None] - w[None], axis=2) for w in paths[1:]]
     assert np.mean(gap[0].min(axis=1) < 3.0) > 0.5
     assert gap[1].min() > base.max_range
-    assert not np.array_equal(ways[0], ways[1])
+    assert not np.array_equal(paths[0], paths[1])
     assert len(campus(dataclasses.replace(base), seed=3).vertices) != len(meshes[0])
 
 
@@ -337,12 +337,12 @@ def test_satellites_are_in_view_where_no_triangle_is_before_them(rng: np.random.
     assert sky.shape == (QUICK.satellites, 3)
     np.testing.assert_allclose(np.linalg.norm(sky, axis=1), 1.0)
     assert sky[:, 2].min() >= np.sin(QUICK.mask)
-    way = world.route().positions(np.linspace(0.0, world.route().length, 20)) + [0.0, 0.0, 1.8]
-    rays = np.hstack([np.repeat(way, len(sky), axis=0), np.tile(sky, (len(way), 1))])
-    wanted = np.isnan(plain_ranges(world.vertices, world.triangles, rays)).reshape(len(way), -1)
-    seen = satellites_in_view(caster, way, sky)
+    path = world.route().positions(np.linspace(0.0, world.route().length, 20)) + [0.0, 0.0, 1.8]
+    rays = np.hstack([np.repeat(path, len(sky), axis=0), np.tile(sky, (len(path), 1))])
+    wanted = np.isnan(plain_ranges(world.vertices, world.triangles, rays)).reshape(len(path), -1)
+    seen = satellites_in_view(caster, path, sky)
     np.testing.assert_array_equal(seen, wanted)
-    inside = plan_campus(QUICK, SEED).inside(way)
+    inside = plan_campus(QUICK, SEED).inside(path)
     assert inside.sum() > 2
     assert not seen[inside].any(axis=1).all()
     assert seen.sum(axis=1).max() > 8

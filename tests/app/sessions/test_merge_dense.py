@@ -154,8 +154,8 @@ def test_two_drives_become_one_map(drives: list[HallDrive], merged: Any) -> None
 
 def test_drives_of_clouds_become_one_map(tmp_path: Path) -> None:
     world, rng = hall(cars=60), np.random.default_rng(3)
-    ways = straight_path(8.0, 44.0, 8.0, step=0.75), straight_path(50.0, 16.0, 9.0, yaw=np.pi, step=0.75)
-    drives = [hall_drive(world, way, rng, clouds=True) for way in ways]
+    paths = straight_path(8.0, 44.0, 8.0, step=0.75), straight_path(50.0, 16.0, 9.0, yaw=np.pi, step=0.75)
+    drives = [hall_drive(world, path, rng, clouds=True) for path in paths]
     runs = [solved(d, name, tmp_path / name) for d, name in zip(drives, ("there", "back"))]
     assert (tmp_path / "there" / "cloud.ply").is_file()
     m = graphslam.merge([r.folder for r in runs])
@@ -212,8 +212,8 @@ def test_gps_ties_what_was_never_seen_twice(tmp_path: Path) -> None:
     """Two halls that are not one; their fixes are in one frame. Without GPS they do not hang together."""
     rng = np.random.default_rng(8)
     a = hall_drive(hall(cars=60), straight_path(8.0, 35.0, 8.0, step=0.75), rng)
-    way = straight_path(-15.0, 12.0, 0.0, step=0.75)
-    b = hall_drive(corridor(120.0), way, rng)
+    path = straight_path(-15.0, 12.0, 0.0, step=0.75)
+    b = hall_drive(corridor(120.0), path, rng)
     moved = np.array([80.0, 30.0, 0.0, 0.0, 0.0, np.sin(0.4), np.cos(0.4)])
     b = HallDrive(b.submaps, b.path.transformed(moved))
     pair = [solved(d, n, tmp_path / n, gps="all", seed=k) for k, (d, n) in enumerate([(a, "hall"), (b, "corridor")])]

@@ -22,8 +22,8 @@ NONE = np.zeros(0, dtype=np.int64)
 def drive(seed, *, scans=160, laps=1.4, landmarks=30, clutter=0.0, ranges_only=0.0, sigma=(0.1, 0.02)):
     """A circle past landmarks on either side, seen more than once: (u, observations, ids) per scan, and the truth."""
     rng = np.random.default_rng(seed)
-    radius, way = 20.0, laps * 2 * np.pi / scans
-    u = np.array([radius * way, 0.0, way])
+    radius, turn = 20.0, laps * 2 * np.pi / scans
+    u = np.array([radius * turn, 0.0, turn])
     angle = rng.uniform(0, 2 * np.pi, landmarks)
     out = radius + rng.uniform(2, 6, landmarks) * rng.choice([-1, 1], landmarks)
     world = np.column_stack([out * np.sin(angle), radius - out * np.cos(angle)])

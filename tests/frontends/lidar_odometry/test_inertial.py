@@ -101,11 +101,11 @@ def test_a_running_product_is_that_of_a_loop(rng):
 def test_a_way_is_that_of_preintegration(rng):
     imu, bias = shaken(rng), np.array([0.02, -0.01, 0.03])
     begin, ends = 0.1234, np.array([0.3, 0.777, 1.5])
-    way = ImuReadings(imu).motion(begin, ends, bias)
+    motion = ImuReadings(imu).motion(begin, ends, bias)
     twin = preintegrate(imu, np.full(3, begin), ends, np.concatenate([bias, np.zeros(3)]))
-    np.testing.assert_allclose(se3.quat_to_matrix(way.q), twin.R, atol=1e-9)
-    np.testing.assert_allclose(way.v, twin.v, atol=2e-5)
-    np.testing.assert_allclose(way.p, twin.p, atol=2e-5)
+    np.testing.assert_allclose(se3.quat_to_matrix(motion.q), twin.R, atol=1e-9)
+    np.testing.assert_allclose(motion.v, twin.v, atol=2e-5)
+    np.testing.assert_allclose(motion.p, twin.p, atol=2e-5)
 
 
 def test_a_way_backwards_undoes_the_way_there(rng):
@@ -150,18 +150,18 @@ def test_velocity_and_gravity_are_those_of_the_positions(rng):
     tau = -np.linspace(0.0, 3.0, 13)
     readings = ImuReadings(shaken(rng))
     variance = readings.doubt(tau, 1e-3)
-    way = InertialMotion(tau, np.tile([0.0, 0, 0, 1], (13, 1)), np.zeros((13, 3)), rng.normal(size=(13, 3)))
+    motion = InertialMotion(tau, np.tile([0.0, 0, 0, 1], (13, 1)), np.zeros((13, 3)), rng.normal(size=(13, 3)))
     z = []
     for _ in range(200):
         v, g = rng.normal(size=3), rng.normal(0.0, 0.5, size=3) + [0, 0, -GRAVITY]
         p = (
             tau[:, None] * v
             + 0.5 * tau[:, None] ** 2 * g
-            + way.p
+            + motion.p
             + rng.normal(size=(13, 3)) * np.sqrt(variance)[:, None]
         )
         guess = g + rng.normal(0.0, 1.0, 3)
-        found_v, found_g, C = fit_velocity_gravity(way, p, variance, guess, 1.0)
+        found_v, found_g, C = fit_velocity_gravity(motion, p, variance, guess, 1.0)
         e = np.stack([found_v - v, found_g - g])
         z.append(np.einsum("ic,ij,jc->", e, np.linalg.inv(C[1:, 1:]), e) / 6)
     assert 0.85 < np.mean(z) < 1.15

@@ -188,14 +188,14 @@ def test_without_gravity_frames_are_whole_poses_in_both_directions() -> None:
 def test_ties_are_broken_at_random() -> None:
     """The fronts from a re-entered map and from the other side meet at one interval: each of them takes it."""
     m = square()
-    ways = set()
+    outcomes = set()
     for seed in range(40):
         s = grow_sample(m, root_of_particle(m, 0, 9), np.random.default_rng(seed))
         place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
         for q in ((2, 4), (4, 6), (6, 8)):
-            ways.add((q, tuple(s.intervals[s.via[place[q]]].tolist()), int(s.depth[place[q]])))
+            outcomes.add((q, tuple(s.intervals[s.via[place[q]]].tolist()), int(s.depth[place[q]])))
     # the link to the entered map is one of depth, but costs no turn
-    assert ways == {((2, 4), (0, 2), 2), ((6, 8), (8, 9), 1), ((4, 6), (2, 4), 3), ((4, 6), (6, 8), 2)}
+    assert outcomes == {((2, 4), (0, 2), 2), ((6, 8), (8, 9), 1), ((4, 6), (2, 4), 3), ((4, 6), (6, 8), 2)}
 
 
 def test_the_same_generator_gives_the_same_sample() -> None:

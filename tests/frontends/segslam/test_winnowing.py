@@ -63,10 +63,10 @@ def _plain(
         for s, pose in enumerate(m[i].path):
             here = se2_compose(sample.poses[k], pose)
             d = float(np.hypot(*(here[:2] - body[:2])))
-            way = sample.travelled[k] + abs(m.path_length[sample.intervals[k, 0] + s] - m.path_length[sample.anchor[k]])
-            z = d / (c.sigma + c.sigma_per_metre * way)
+            arc = sample.travelled[k] + abs(m.path_length[sample.intervals[k, 0] + s] - m.path_length[sample.anchor[k]])
+            z = d / (c.sigma + c.sigma_per_metre * arc)
             if z <= c.sigmas and (best is None or z < best[0]):
-                best = (z, d, way)
+                best = (z, d, arc)
         if best is not None:
             out[i] = best[1:]
     return out

@@ -47,11 +47,11 @@ def misread(imu: Imu, A: np.ndarray) -> Imu:
 
 def test_every_exchange_is_found() -> None:
     imu, path = drive(tilt=0.15)
-    ways = signed_permutations()
-    assert len({tuple(A.ravel()) for A in ways}) == 48
-    np.testing.assert_array_equal(ways[0], np.eye(3))
-    assert np.sum(np.linalg.det(ways) > 0) == 24
-    for k, A in enumerate(ways):
+    mountings = signed_permutations()
+    assert len({tuple(A.ravel()) for A in mountings}) == 48
+    np.testing.assert_array_equal(mountings[0], np.eye(3))
+    assert np.sum(np.linalg.det(mountings) > 0) == 24
+    for k, A in enumerate(mountings):
         found = check_imu_axes(misread(imu, A), path)
         np.testing.assert_array_equal(found.A, A)
         assert found.wrong == (k > 0)

@@ -287,11 +287,11 @@ def test_what_is_left_out_is_counted(rng):
     ids = g.add_sensor(late, config=ImuConfig(gravity=False))
     counts = dropped(g)
     assert set(counts) == {"before the first reading", "a pause in the readings", "after the last reading"}
-    ways = sum(isinstance(r, ImuRecord) for r in g.records.values())
-    assert ways + sum(counts.values()) == steps
+    factors = sum(isinstance(r, ImuRecord) for r in g.records.values())
+    assert factors + sum(counts.values()) == steps
     links = [r for r in g.records.values() if isinstance(r, ImuBiasRecord)]
     assert [r.before is None for r in links] == [True, False]  # the start, and the walk over the pause
-    assert len(ids) == ways + 2
+    assert len(ids) == factors + 2
     far = chain(made)
     far.add_sensor(made.imu, config=ImuConfig(longest=1.0))
     assert dropped(far)["too far apart"] == steps
