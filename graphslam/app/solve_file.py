@@ -80,6 +80,7 @@ def solution_json(solution: NetworkSolution) -> dict[str, Any]:
         "dim": network.dim,
         "poses": len(network),
         "edges": len(network.edges),
+        "position_priors": int(network.position_priors.sum()),
         "landmarks": len(network.landmark_ids),
         "observations": len(network.observations),
         "states": network.states,

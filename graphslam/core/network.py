@@ -187,6 +187,9 @@ class PoseNetwork:
         Inverse covariance of ``Log(z⁻¹ x_i⁻¹ x_j)``, GTSAM's tangent order, positive semi-definite.
     fixed : (n,) bool
         Vertices fixed at their given pose. If none: the first vertex is fixed (gauge).
+    position_priors : (m,) bool
+        Edges that measure only the position of their second vertex, ``t_j - z``, for example by GPS. They are the last
+        ones; their first vertex is fixed at the origin, and measurement and information have no rotation.
     landmark_ids : (l,) int64
         Disjoint from ``ids``. 2-D only, as all following fields.
     landmarks : (l, 2)
@@ -216,6 +219,7 @@ class PoseNetwork:
     measurements: Array
     information: Array
     fixed: Mask = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    position_priors: Mask = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     landmark_ids: Ids = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
     has_landmark: Mask = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
@@ -234,6 +238,8 @@ class PoseNetwork:
         width, d = (3, 3) if self.dim == 2 else (7, 6)
         if len(self.fixed) == 0:
             object.__setattr__(self, "fixed", np.zeros(n, dtype=np.bool_))
+        if not np.any(self.position_priors):
+            object.__setattr__(self, "position_priors", np.zeros(m, dtype=np.bool_))
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             "ids": ((n,), np.int64),
             "poses": ((n, width), np.float64),
@@ -242,6 +248,7 @@ class PoseNetwork:
             "measurements": ((m, width), np.float64),
             "information": ((m, d, d), np.float64),
             "fixed": ((n,), np.bool_),
+            "position_priors": ((m,), np.bool_),
             "landmark_ids": ((l,), np.int64),
             "landmarks": ((l, 2), np.float64),
             "has_landmark": ((l,), np.bool_),
@@ -278,6 +285,16 @@ class PoseNetwork:
         if (self.fixed & ~self.has_initial).any():
             k = int(np.flatnonzero(self.fixed & ~self.has_initial)[0])
             raise DataError("a fixed vertex has no pose in the file", where=self.source, got=f"vertex {self.ids[k]}")
+        priors = np.flatnonzero(self.position_priors)
+        origin = self.edges[priors, 0]
+        if (np.diff(self.position_priors.astype(int)) < 0).any() or not (
+            self.fixed[origin].all() and (self.poses[origin] == np.eye(self.poses.shape[1])[-1] * (self.dim == 3)).all()
+        ):
+            raise DataError("position priors are the last edges, from a vertex fixed at the origin", where=self.source)
+        turn = slice(2, 3) if self.dim == 2 else slice(0, 3)
+        identity = [0.0] if self.dim == 2 else [0.0, 0.0, 0.0, 1.0]
+        if self.information[priors, turn].any() or (self.measurements[priors, self.dim :] != identity).any():
+            raise DataError("a position prior has no rotation", where=self.source)
 
     def _check_values(self) -> None:
         for name, values, label in (
@@ -319,8 +336,10 @@ class PoseNetwork:
             a.setflags(write=False)
 
     def edge_name(self, k: int) -> str:
-        """``"3 -> 7"``, in the file's ids."""
+        """``"3 -> 7"``, in the file's ids; ``"position of 7"``."""
         i, j = self.edges[k]
+        if self.position_priors[k]:
+            return f"position of {self.ids[j]}"
         return f"{self.ids[i]} -> {self.ids[j]}"
 
     def observation_name(self, k: int) -> str:
@@ -350,7 +369,19 @@ class PoseNetwork:
     @property
     def residuals(self) -> int:
         """Number of measured scalars."""
-        return len(self.edges) * self.tangent_dim + 2 * len(self.observations)
+        positions = int(np.count_nonzero(self.position_priors))
+        return (len(self.edges) - positions) * self.tangent_dim + positions * self.dim + 2 * len(self.observations)
+
+    @property
+    def relative(self) -> Mask:
+        """Edges between two poses ``(m,)``: not position priors, and not what else fixes directions of their datum
+        (:func:`graphslam.core.position_priors.complete_datum`)."""
+        out = ~self.position_priors
+        if not out.all():
+            held = np.flatnonzero(out & self.fixed[self.edges[:, 0]])
+            w = np.linalg.eigvalsh(self.information[held])
+            out[held] = w[:, 0] > 1e-12 * w[:, -1]
+        return out
 
     def with_poses(self, poses: ArrayLike, landmarks: ArrayLike | None = None) -> PoseNetwork:
         """The same measurements with other values, e.g. a solution for writing to a file."""
@@ -367,7 +398,7 @@ class PoseNetwork:
 
     def steps_along_numbers(self, group: Group) -> Array:
         """Relative pose ``(n - 1, 3|7)`` from each vertex to the next, by the first edge between them."""
-        near = np.flatnonzero(np.abs(np.diff(self.edges, axis=1).ravel()) == 1)
+        near = np.flatnonzero((np.abs(np.diff(self.edges, axis=1).ravel()) == 1) & self.relative)
         node, at = np.unique(self.edges[near].min(axis=1), return_index=True)
         bare = np.setdiff1d(np.arange(len(self) - 1), node)
         if len(bare):
@@ -388,6 +419,7 @@ class PoseNetwork:
             edges=self.edges[e],
             measurements=self.measurements[e],
             information=self.information[e],
+            position_priors=self.position_priors[e],
             observations=self.observations[o],
             observation_values=self.observation_values[o],
             observation_information=self.observation_information[o],

@@ -9,11 +9,13 @@ import numpy as np
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.network import Mask, PoseNetwork
+from graphslam.core.poses import group_of
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import FactorBatch
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.observation import ObservationBatch
+from graphslam.graph.factors.position import PositionBatch
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import KINDS, Values, VariableLayout
@@ -32,7 +34,8 @@ def network_values(network: PoseNetwork, poses: Array, landmarks: Array | None =
 def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordered: bool = True) -> FactorArrays:
     """The measurements of a network as a least-squares problem, stored as arrays.
 
-    Factors are numbered through the edges, then the observations. Fixed vertices (or the first one) are held.
+    Factors are numbered through the edges, with position priors last, then the observations. Fixed vertices (or the
+    first one) are held.
 
     Parameters
     ----------
@@ -45,6 +48,7 @@ def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordere
     e = slice(None) if used is None else np.flatnonzero(used[:m])
     o = slice(None) if used is None else np.flatnonzero(used[m:])
     edges, seen = network.edges[e], network.observations[o]
+    z, information, relative = network.measurements[e], network.information[e], ~network.position_priors[e]
     counts = tuple({"x": n, "l": l}.get(word, 0) for word in KINDS)
     fixed = tuple(network.anchors.tolist())
     order = None
@@ -57,8 +61,12 @@ def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordere
         order = free[elimination_order(i[free_pair], j[free_pair], len(free))] if len(free) else free
     layout = VariableLayout(network.dim, counts, network.landmark_ids, fixed, order)
     batches: list[FactorBatch] = [
-        BetweenBatch.of_arrays(edges, network.measurements[e], whiteners(network.information[e]), layout)
+        BetweenBatch.of_arrays(edges[relative], z[relative], whiteners(information[relative]), layout)
     ]
+    if not relative.all():
+        d, block = network.dim, group_of(network.poses).position
+        W = whiteners(information[~relative, block, block])
+        batches.append(PositionBatch.of_arrays(edges[~relative, 1], z[~relative, :d], W, layout))
     if len(seen):
         polar = network.observation_kind == "bearing-range"
         W = whiteners(network.observation_information[o])

@@ -20,6 +20,8 @@ from graphslam.core.network import (
     check_informations,
     repair_informations,
 )
+from graphslam.core.poses import SE2, SE3
+from graphslam.core.position_priors import complete_datum
 from graphslam.core.se3 import quat_normalize
 
 log = logging.getLogger(__name__)
@@ -69,6 +71,7 @@ class NetworkBuilder:
     marks: tuple[Ids, Array] = field(default_factory=lambda: (_no_ids(0), _none(0, 2)))
     fixed: tuple[Ids, Ids] = field(default_factory=lambda: (_no_ids(0), _no_ids(0)))
     edges: tuple[Ids, Array, Array] | None = None
+    positions: int = 0
     detections: tuple[Ids, Array, Array] | None = None
     edge_lines: Ids = field(default_factory=lambda: _no_ids(0))
     observation_lines: Ids = field(default_factory=lambda: _no_ids(0))
@@ -117,6 +120,20 @@ class NetworkBuilder:
             )
         information = self.sound(information, edge_labels(pairs), "edge information matrices")
         self.edges, self.edge_lines = (pairs, self._unit(measurements, lines), information), lines
+
+    def add_positions(self, pairs: Ids, positions: Array, information: Array, lines: Ids) -> None:
+        """Position priors, after the edges: (origin, vertex) ``(p, 2)``, ``(p, dim)`` and ``(p, dim, dim)``."""
+        labels = Labels(lambda k: f"position of {pairs[k, 1]}, {self.where(int(lines[k]))}")
+        information = self.sound(information, labels, "information matrices of positions")
+        silent = np.flatnonzero(~information.any(axis=(1, 2)))
+        if len(silent):
+            raise FormatError("a position has information zero", where=self.where(int(lines[silent[0]])), wanted="> 0")
+        group, p = (SE2 if self.dim == 2 else SE3), len(pairs)
+        z, omega = np.tile(group.identity, (p, 1)), np.zeros((p, group.dof, group.dof))
+        z[:, : self.dim], omega[:, group.position, group.position] = positions, information
+        before, values, matrices = self.edges or (_no_ids(0, 2), z[:0], omega[:0])
+        self.edges = np.vstack([before, pairs]), np.vstack([values, z]), np.concatenate([matrices, omega])
+        self.edge_lines, self.positions = np.concatenate([self.edge_lines, lines]), p
 
     def add_observations(self, pairs: Ids, values: Array, information: Array, lines: Ids) -> None:
         """Landmark observations; ``pairs`` ``(k, 2)`` = (vertex id, landmark id)."""
@@ -172,7 +189,7 @@ class NetworkBuilder:
         at = np.searchsorted(marks, self.marks[0])
         landmarks[at], has_mark[at] = self.marks[1], True
         try:
-            return PoseNetwork(
+            network = PoseNetwork(
                 dim=self.dim,
                 ids=ids,
                 poses=poses,
@@ -181,6 +198,7 @@ class NetworkBuilder:
                 measurements=measurements,
                 information=information,
                 fixed=self._held(ids, has),
+                position_priors=np.arange(len(pairs)) >= len(pairs) - self.positions,
                 landmark_ids=marks,
                 landmarks=landmarks,
                 has_landmark=has_mark,
@@ -194,6 +212,7 @@ class NetworkBuilder:
             )
         except GeometryError as error:
             raise FormatError(str(error)) from None
+        return complete_datum(network)
 
     def _check_named(self, pairs: Ids, seen: Ids) -> None:
         """Every vertex of a measurement must be given, unless no vertex is or ``create_missing`` is set."""

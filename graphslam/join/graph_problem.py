@@ -127,8 +127,10 @@ class JoinProblem:
         name, n = network.source, len(network)
         if poses < 1:
             raise DataError("a submap has no step", where=name, got=poses, wanted="at least 1 pose")
-        if len(network.landmark_ids):
-            raise DataError("a pose graph with landmarks cannot be cut", where=name, wanted="poses alone")
+        if len(network.landmark_ids) or network.position_priors.any():
+            raise DataError(
+                "a pose graph with landmarks or position priors cannot be cut", where=name, wanted="poses alone"
+            )
         if n < 2 or network.anchors.tolist() != [0]:
             raise DataError("one vertex is held, the first", where=name, got=network.anchors.tolist()[:5])
         graph = FactorGraph(network.dim)

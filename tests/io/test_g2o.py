@@ -341,14 +341,15 @@ def test_lines_without_noise_and_the_older_names(tmp_path: Path) -> None:
         read_network(put(tmp_path, "EDGE2 0 1 1 0 0.1 1 0 0 1 0 1\nEDGE3 0 1 1 0 0 0 0 0.5\n", "c.txt"))
 
 
-def test_priors_as_g2o_writes_them_and_those_of_a_position(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_priors_as_g2o_writes_them(tmp_path: Path) -> None:
     base = read_g2o(put(tmp_path, SE3 + f"EDGE_PRIOR_SE3:QUAT 1 0 3 0 0 0 0 0 1 {INFO3}\n"))
     for line in (f"EDGE_SE3_PRIOR 1 0 3 0 0 0 0 0 1 {INFO3}", f"EDGE_PRIOR_SE3 1 3 0 0 0 0 0 1 {INFO3}"):
         net = read_network(put(tmp_path, line + "\n" + SE3))
         assert np.array_equal(net.measurements, base.measurements)
-    position = read_network(put(tmp_path, SE3 + "EDGE_SE3_PRIOR_XYZ 1 3 0 0 1 0 0 1 0 1\n"))
-    assert len(position.edges) == 1
-    assert "1 records EDGE_SE3_PRIOR_XYZ are left out: priors of a position alone are not read" in caplog.text
+    offset = SE3 + "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\nPARAMS_SE3OFFSET 4 0 0.5 0 0 0 0 1\n"
+    assert np.array_equal(read_network(put(tmp_path, offset + line + "\n")).measurements, base.measurements)
+    with pytest.raises(FormatError, match=r"f\.g2o:6.*sensor that is not at its vertex; got parameter 4"):
+        read_network(put(tmp_path, offset + f"EDGE_SE3_PRIOR 1 4 3 0 0 0 0 0 1 {INFO3}\n"))
 
 
 def test_long_quaternions_are_normalised_and_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

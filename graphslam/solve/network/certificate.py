@@ -93,6 +93,8 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
     """
     if len(network.observations):
         return Certificate("not known", "landmark observations are not part of the relaxation")
+    if network.position_priors.any():
+        return Certificate("not known", "position priors are not part of the relaxation")
     if len(network.anchors) > 1:
         return Certificate("not known", "several vertices are held in place")
     try:

@@ -80,7 +80,7 @@ def odometry_edges(network: PoseNetwork) -> Mask:
 
     A file with arbitrary ids has some such edges by chance; they are not used.
     """
-    step = np.asarray(np.abs(network.edges[:, 1] - network.edges[:, 0]) == 1)
+    step = np.asarray(np.abs(network.edges[:, 1] - network.edges[:, 0]) == 1) & network.relative
     joined = np.unique(network.edges[step].min(axis=1)) if step.any() else np.zeros(0)
     if len(joined) < CHAINED * (len(network) - 1):
         return np.zeros(len(step), dtype=np.bool_)

@@ -17,15 +17,17 @@ from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.network import Ids, PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.core.position_priors import HELD
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.observation import ObservationRecord
+from graphslam.graph.factors.position import PositionRecord
 from graphslam.graph.network import network_values
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import Values
 from graphslam.solve.isam2 import Isam2Solver
-from graphslam.solve.network.start import cartesian_observations, neighbours
+from graphslam.solve.network.start import cartesian_observations, chordal_start, neighbours
 
 log = logging.getLogger(__name__)
 # Default limit of updates: each then relinearises more variables and usually gets nearer to the optimum.
@@ -34,13 +36,15 @@ UPDATES = 500
 THRESHOLD, SKIP = 0.1, 10
 # Other fixed vertices are connected to the first one with this standard deviation [m, rad].
 HELD_SIGMA = 1e-6
+# The first vertex of a part whose frame comes from position priors has this standard deviation [m, rad] until the end.
+BEGIN_SIGMA = 1.0
 
 
 def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
     """Vertices in id order as far as possible, each with its edges to previous vertices.
 
     A vertex is added when it is connected to previous ones, the lowest id first. A chain of odometry therefore keeps
-    its order.
+    its order. Position priors connect nothing: a part without a fixed vertex begins at the lowest one with a prior.
     """
     first, edge, other = neighbours(network)
     inside = np.zeros(len(network), dtype=bool)
@@ -48,13 +52,20 @@ def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
     heap = [int(a) for a in network.anchors]
     heapq.heapify(heap)
     queued[network.anchors] = True
-    while heap:
+    relative = network.relative
+    begins = iter(np.unique(network.edges[~relative, 1]).tolist())
+    while True:
+        while not heap and (begin := next(begins, None)) is not None:
+            if not queued[begin]:
+                heap, queued[begin] = [begin], True
+        if not heap:
+            return
         v = heapq.heappop(heap)
         inside[v] = True
         span = slice(first[v], first[v + 1])
         yield v, [int(e) for e, w in zip(edge[span], other[span], strict=True) if inside[w]]
-        for w in other[span]:
-            if not queued[w]:
+        for e, w in zip(edge[span], other[span], strict=True):
+            if relative[e] and not queued[w]:
                 queued[w] = True
                 heapq.heappush(heap, int(w))
 
@@ -95,19 +106,39 @@ def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) 
     z, ends, polar = network.measurements, node[network.edges], network.observation_kind == "bearing-range"
     z_back = group.inverse(z)
     local, _ = cartesian_observations(network)
+    relative, aligned = network.relative, None
+    begun: list[int] = []
     seen_from: list[list[int]] = [[] for _ in range(len(network))]
     for k, (v, _) in enumerate(network.observations.tolist()):
         seen_from[v].append(k)
+    for e in np.flatnonzero(~relative & ~network.position_priors):
+        # directions of a frame, which cost nothing at any weight; GTSAM needs information in every one
+        W[e] = whiteners(network.information[e : e + 1] / HELD + 1e-6 * np.eye(group.dof))[0]
     for count, (v, links) in enumerate(Bar(steps, name="iSAM2", unit="pose", shown=progress)):
         if count:
-            pose = held[v] if v in held else _from_neighbour(graph, network, v, links, node, z, z_back)
+            near = [e for e in links if relative[e]]
+            if v in held or near:
+                pose = held[v] if v in held else _from_neighbour(graph, network, v, near, node, z, z_back)
+            else:
+                aligned = chordal_start(network)[0] if aligned is None else aligned
+                pose = aligned[v]
             graph.append_node(pose)
+            if v not in held and not near:
+                # its orientation, until there are enough positions for the frame
+                begun.append(graph.next_factor())
+                graph.insert(
+                    BetweenRecord(begun[-1], 0, count, group.between(origin, pose), np.eye(group.dof) / BEGIN_SIGMA)
+                )
             if v in held:
                 offset = group.between(origin, pose)
                 graph.insert(BetweenRecord(graph.next_factor(), 0, count, offset, np.eye(group.dof) / HELD_SIGMA))
         for e in links:
             i, j = ends[e].tolist()
-            graph.insert(BetweenRecord(graph.next_factor(), i, j, z[e], W[e]))
+            if network.position_priors[e]:
+                root = whiteners(network.information[e : e + 1, group.position, group.position])[0]
+                graph.insert(PositionRecord(graph.next_factor(), j, z[e, : group.dim], root))
+            else:
+                graph.insert(BetweenRecord(graph.next_factor(), i, j, z[e], W[e]))
         for k in seen_from[v]:
             mark = network.observations[k, 1:]
             graph.start_landmarks(mark, se2_transform(graph.structure.poses[count], local[k])[None])
@@ -117,6 +148,10 @@ def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) 
             graph.insert(record)
         if (count + 1) % batch == 0 or count + 1 == len(steps):
             solver.update()
+    for factor in begun:
+        graph.remove(factor)
+    if begun:
+        solver.update()
     found = graph.values
     poses, marks = network.poses.copy(), network.landmarks.copy()
     poses[vertices] = found.poses

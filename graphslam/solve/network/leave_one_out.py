@@ -36,6 +36,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.core.position_priors import keep_datum
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.variables import Values
@@ -307,7 +308,7 @@ def leave_one_out_test(
     """
     m, d = len(network.edges), network.tangent_dim
     w = np.linalg.eigvalsh(network.information)
-    judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
+    judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1]) & ~network.position_priors
     limit, scale, rounds = limit.copy(), 0.0, 0
     dull = chi2_quantile(DULL, d)
     seen: set[bytes] = set()
@@ -334,7 +335,7 @@ def leave_one_out_test(
             if own_tail:
                 stated = chi2_quantile(quantile, d)
                 most = min(most, stated) if len(inside) >= FEW else stated
-                limit[:m] = np.where(np.isinf(limit[:m]), np.inf, most)
+                limit[:m] = np.where(np.isinf(limit[:m]) | network.position_priors, limit[:m], most)
             bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())
             fresh[inside[bad]] = False
             worst[inside[bad]] = np.nan
@@ -354,6 +355,7 @@ def leave_one_out_test(
         if len(good):
             alone, group, _ = loop_evidence(flat, inliers, good, here, accepted=False)
             fresh[good[np.maximum(alone, group) <= limit[good]]] = True
+        fresh = keep_datum(network, fresh)
         if (fresh == inliers).all() or rounds == ROUNDS:
             break
         back = fresh.tobytes() in seen

@@ -20,6 +20,7 @@ from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.core.position_priors import keep_datum
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import network_values
@@ -85,10 +86,11 @@ def truncated_least_squares(
         Probability of keeping an inlier with Gaussian noise.
     trust_odometry : bool
         Edges between neighbours in id order are never outliers (they are not loop closures), if they connect nearly all
-        vertices; otherwise no edge is trusted.
+        vertices; otherwise no edge is trusted. Position priors can be outliers, as long as
+        at least half of them, and enough for the frame, are left.
     noise_scale : float, optional
-        s², true variance of the edges over that in the file; default: estimated. The noise of landmark observations is
-        not scaled.
+        s², true variance of the edges over that in the file; default: estimated. The noise of landmark observations and
+        of position priors is not scaled.
     """
     if not 0.0 < probability < 1.0:
         raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
@@ -100,7 +102,8 @@ def truncated_least_squares(
     if trust_odometry:
         trusted[:m] = odometry_edges(network)
     starts: dict[str, tuple[Values, Mask]] = {}
-    loops = int(np.count_nonzero(~trusted[:m]))
+    absolute = ~network.relative
+    loops = int(np.count_nonzero(~trusted[:m] & ~absolute))
     guessed = np.count_nonzero(consensus.likely) >= BORNE_OUT * loops
     if noise_scale is None and not guessed:
         noise_scale = 1.0
@@ -108,7 +111,7 @@ def truncated_least_squares(
     for name, believed in (("consensus", consensus.likely), ("core", consensus.core)):
         if believed.any() and not (name == "core" and (believed == consensus.likely).all()):
             used = trusted | True
-            used[:m] = consensus.odometry | believed
+            used[:m] = consensus.odometry | believed | absolute
             begun = _least_squares(network, used, chordal=True)
             if begun is None:
                 continue
@@ -118,6 +121,7 @@ def truncated_least_squares(
                 scale = min(_scale(network, costs, used, believed), scale if len(starts) > 1 else np.inf)
     if not starts and trusted.any():
         used = trusted.copy()
+        used[:m] |= absolute
         used[m:] = True
         begun = _least_squares(network, used, chordal=False)
         if begun is not None:
@@ -134,11 +138,12 @@ def truncated_least_squares(
         if name not in starts:
             continue
         values, believed = starts[name]
-        trimmed = _trim(network, flat, values, flat.squared(values) <= limit, limit)
+        trimmed = _trim(network, flat, values, keep_datum(network, flat.squared(values) <= limit), limit)
         confirmed = (trimmed.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED
         if not (name == "consensus" and confirmed):
             weights, annealed = _anneal(network, flat, values, limit, believed)
-            trimmed = min(trimmed, _trim(network, flat, annealed, weights > 0.5, limit), key=lambda t: t.truncated)
+            again = _trim(network, flat, annealed, keep_datum(network, weights > 0.5), limit)
+            trimmed = min(trimmed, again, key=lambda t: t.truncated)
         here, kept = trimmed.end.values, trimmed.inliers
         best = leave_one_out_test(
             network, flat, here, kept, limit, probability=probability, own_tail=noise_scale is None
@@ -193,7 +198,7 @@ def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> fl
     Residuals after the fit are smaller than the noise: ``rows`` residuals have ``rows - states`` degrees of freedom.
     """
     m = len(network.edges)
-    rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
+    rows = network.only(used).residuals
     left = max(rows - network.states, 1) / rows
     costs = costs[:m][believed]
     costs = costs[costs > REPEATED]  # loops at standstill have no information on noise
@@ -204,7 +209,8 @@ def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> fl
 
 def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mask) -> Array:
     limit = np.full(len(trusted), chi2_quantile(probability, 2))
-    limit[: len(network.edges)] = scale * chi2_quantile(probability, network.tangent_dim)
+    edges = scale * chi2_quantile(probability, network.tangent_dim)
+    limit[: len(network.edges)] = np.where(network.position_priors, chi2_quantile(probability, network.dim), edges)
     limit[trusted] = np.inf
     return limit
 
@@ -224,6 +230,7 @@ def _anneal(
     weights = np.ones(len(limit))
     for _ in range(STAGES):
         weights = np.where(loose, truncation_weights(now, mu), 1.0)
+        weights[keep_datum(network, weights > 0.0) & (weights <= 0.0)] = 1.0
         values = descend_to_minimum(weighted_problem(network, weights), values, max_iterations=STEPS).values
         now = ratio(values)
         if not ((weights > 0.0) & (weights < 1.0)).any():
@@ -243,7 +250,7 @@ def _trim(
         inner = weighted_problem(network, inliers)
         end = descend_to_minimum(inner, values, max_iterations=steps)
         costs = flat.squared(end.values)
-        fresh = costs <= limit
+        fresh = keep_datum(network, costs <= limit)
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values

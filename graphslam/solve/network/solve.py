@@ -205,7 +205,8 @@ def solve_network(
     check_full_rank(network, flat, initial)
     answer = run(_Task(network, flat, starts, options, progress))
     best = answer.optimum.best
-    value = best.objective if answer.values is best.values else flat.objective(answer.values)
+    known = answer.values is best.values and np.isfinite(best.objective)
+    value = best.objective if known else flat.objective(answer.values)
     gap = value - best.objective
     if answer.values is best.values and best.converged:
         # evaluated where the descent ended: one step later, a decrement at the limit can be above it
@@ -325,7 +326,7 @@ def _gnc(task: _Task) -> _Answer:
     optimum = asked or _from_robust(flat, robust)
     out = np.flatnonzero(~robust.inliers)
     m = len(network.edges)
-    loops = ~odometry_edges(network)
+    loops = ~odometry_edges(network) & network.relative
     kept = int(np.count_nonzero(robust.inliers[:m] & loops))
     doubt = ""
     # loops confirmed by neighbours can be fewer than those that contradict everything
@@ -334,6 +335,12 @@ def _gnc(task: _Task) -> _Answer:
         doubt = (
             f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with each other and with the odometry "
             "with its assumed noise; either most loops are wrong, or the odometry is worse than stated"
+        )
+    beyond = network.position_priors & robust.inliers[:m] & (flat.squared(end.values) > robust.limit)[:m]
+    if not doubt and beyond.any():
+        doubt = (
+            f"{np.count_nonzero(beyond)} position priors contradict the other measurements with their assumed noise, "
+            "too many to be outliers, so none of them was rejected"
         )
     details: dict[str, Any] = {
         "doubt": doubt,

@@ -20,6 +20,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import Mask, PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.core.position_priors import align_to_positions, without_position_priors
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import problem_of_network
 from graphslam.solve.sparse import MANY, BlockElimination, factorise_sparse
@@ -121,12 +122,14 @@ def tree_poses(network: PoseNetwork, tree: SpanningTree) -> Array:
 
 def odometry_start(network: PoseNetwork) -> Array:
     """Dead reckoning: every vertex from its predecessor in id order if there is an edge, otherwise from any edge."""
-    return tree_poses(network, spanning_tree(network, chain=True))
+    part = without_position_priors(network)
+    return align_to_positions(network, tree_poses(part, spanning_tree(part, chain=True)))
 
 
 def tree_start(network: PoseNetwork) -> Array:
     """Breadth-first spanning tree: fewest edges between a vertex and an anchor, so the least accumulated error."""
-    return tree_poses(network, spanning_tree(network))
+    part = without_position_priors(network)
+    return align_to_positions(network, tree_poses(part, spanning_tree(part)))
 
 
 def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
@@ -138,6 +141,7 @@ def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
     nearer of its two quaternions, must have the sign of the measurements (there, two turns are none). A cycle with a
     closing error of more than a third of a turn is undecided.
     """
+    network = without_position_priors(network)
     tree, (i, j) = spanning_tree(network), network.edges.T
     branch = tree.edge >= 0
     chord = np.ones(len(network.edges), dtype=bool)
@@ -178,7 +182,13 @@ def chordal_start(network: PoseNetwork) -> tuple[Array, Array]:
     poses : (n, 3) or (n, 7)
     landmarks : (l, 2)
     """
-    return translations_from(network, chordal_rotations(network))
+    part = without_position_priors(network)
+    found = translations_from(part, chordal_rotations(part))
+    if part is network:
+        return found
+    aligned = align_to_positions(network, found[0])
+    turns = rotation2(aligned[:, 2]) if network.dim == 2 else se3.quat_to_matrix(aligned[:, 3:])
+    return translations_from(network, turns)
 
 
 def _least_squares(A: sp.csc_matrix, b: Array, width: int) -> Array:
