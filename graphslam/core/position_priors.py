@@ -100,8 +100,8 @@ class _Frame(NamedTuple):
         """
         group, ends = group_of(network.poses), network.edges[:, 1]
         vertex, which = np.unique(ends[used], return_inverse=True)
-        p = np.stack([np.bincount(which, network.measurements[used, k]) for k in range(group.dim)], axis=1)
-        p /= np.bincount(which)[:, None]
+        total = np.stack([np.bincount(which, network.measurements[used, k]) for k in range(group.dim)], axis=1)
+        p = np.asarray(total / np.bincount(which)[:, None], dtype=np.float64)
         p, middle = p - p.mean(axis=0), p.mean(axis=0)
         scale = float(np.linalg.norm(p, axis=1).max()) or 1.0
         J = _motion(group, p, scale)[which]

@@ -114,9 +114,9 @@ def parse_g2o(
                 [ids, edges.whole.ravel(), priors.whole[:, 0], at_vertex, rows["VERTEX_XY"].whole[:, 0]]
             )
             origin = int(np.setdiff1d(np.arange(len(named) + 1), named)[0])
-            line = np.append(priors.lines, position_lines)[:1]
+            first_line = np.append(priors.lines, position_lines)[:1]
             ids, poses = np.append(ids, origin), np.vstack([poses, identity])
-            lines, fixed_lines = np.append(lines, line), np.append(fixed_lines, line)
+            lines, fixed_lines = np.append(lines, first_line), np.append(fixed_lines, first_line)
             fixed = np.append(fixed, origin)
     if len(priors):
         pairs = np.vstack([pairs, np.column_stack([np.full(len(priors), origin), priors.whole[:, 0]])])

@@ -128,9 +128,7 @@ class JoinProblem:
         if poses < 1:
             raise DataError("a submap has no step", where=name, got=poses, wanted="at least 1 pose")
         if len(network.landmark_ids) or network.position_priors.any():
-            raise DataError(
-                "a pose graph with landmarks or position priors cannot be cut", where=name, wanted="poses alone"
-            )
+            raise DataError("landmarks and position priors cannot be cut", where=name, wanted="poses alone")
         if n < 2 or network.anchors.tolist() != [0]:
             raise DataError("one vertex is held, the first", where=name, got=network.anchors.tolist()[:5])
         graph = FactorGraph(network.dim)

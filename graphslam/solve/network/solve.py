@@ -205,8 +205,8 @@ def solve_network(
     check_full_rank(network, flat, initial)
     answer = run(_Task(network, flat, starts, options, progress))
     best = answer.optimum.best
-    known = answer.values is best.values and np.isfinite(best.objective)
-    value = best.objective if known else flat.objective(answer.values)
+    evaluated = answer.values is best.values and np.isfinite(best.objective)
+    value = best.objective if evaluated else flat.objective(answer.values)
     gap = value - best.objective
     if answer.values is best.values and best.converged:
         # evaluated where the descent ended: one step later, a decrement at the limit can be above it
