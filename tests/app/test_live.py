@@ -64,7 +64,7 @@ class Seen(Observer):
 
 def test_a_recording_replays_the_run(log: SensorLog, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    seen, file = Seen(), tmp_path / "new" / "run.rrd"
+    seen, file = Seen(), tmp_path / "run.rrd"
     run = gs.run(log, frontend="ekf", config={"preset": "none", **PLANE}, progress=[LiveView(log.name, file), seen])
     rows = read_back(file)
     paths = rows["/map/path"]

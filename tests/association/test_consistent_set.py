@@ -83,7 +83,7 @@ def test_chi2_of_right_loops_is_consistent_both_ways(rng: np.random.Generator, d
 
     Halving or doubling the stated covariances must fall outside.
     """
-    d, runs = (3 if dim == 2 else 6), 150
+    d, runs = (3 if dim == 2 else 6), 300
     pairs, singles, doubled = [], [], []
     for _ in range(runs):
         poses, z, Q = drive(rng, dim, 30, 0.004)

@@ -154,8 +154,10 @@ def test_the_values_of_the_file_are_those_of_the_run(log_folder: Path) -> None:
     rows = [x[2:] for x in text.splitlines() if x.startswith("# ") and " = " in x and " = …" not in x and x[2] != " "]
     values = tomllib.loads("\n".join(rows))
     assert RunConfig().calibrate.given is None
-    del values["calibrate"]["given"]  # a part that is left out by default: an option of it would add it
     frontend = values.pop("frontend")
+    del values["calibrate"]["given"]
+    for part in ("noise", "smoothing_noise", "biases"):  # left out by default: one option of it would add it
+        del frontend[part]
     recommended = recommended_options(log, "rbpf-ekf")
     own = recommended.pop("frontend")
     assert build_config(RunConfig, values) == build_config(RunConfig, recommended)
