@@ -185,7 +185,8 @@ def _filled(motion: Motion, gap: MotionGap) -> Motion:
         k = int(np.searchsorted(motion.times, gap.end))
         T, covariances = gap.end - gap.begin, motion.covariances.copy()
         increments[k] = se2_exp(T * np.array([v, 0.0, w]))
-        covariances[k] += T * np.diag(usual_variances(motion, np.array([k - 1])))
+        known = int(np.searchsorted(motion.times, gap.end + AROUND, side="right"))  # see find_motion_gaps
+        covariances[k] += T * np.diag(usual_variances(motion.take(slice(0, known)), np.array([k - 1])))
         return replace(motion, increments=increments, covariances=covariances)
     k = int(np.searchsorted(motion.times, gap.begin)) + 1
     times = np.insert(motion.times, k, gap.begin + min(gap.usual, SHORTEST))
