@@ -27,6 +27,7 @@ from graphslam.core.plugins import load_plugin
 from graphslam.core.se3 import se3_transform
 from graphslam.io.autoware import KIND as AUTOWARE
 from graphslam.io.autoware import write_autoware
+from graphslam.io.bag_writer import KIND as BAG
 from graphslam.io.bag_writer import BagForm
 from graphslam.io.geographic import GeographicMap, write_geojson, write_kml
 from graphslam.io.tum import embed_plane, write_kitti, write_tum
@@ -175,7 +176,7 @@ WRITERS = {
     "nav2": Writer(_floor_plans, None, folder=_FLOOR_PLANS),
     "autoware": Writer(_tiles, None, folder=AUTOWARE),
     "mcap": Writer(_bag("mcap"), "run.mcap"),
-    "ros2": Writer(_bag("ros2"), None),
+    "ros2": Writer(_bag("ros2"), None, folder=BAG),
 }
 
 

@@ -41,14 +41,20 @@ def wrap_residual(a):
 
 
 @njit(error_model="numpy", nogil=True)
+def lever_and_offset(x, landmark, sensor):
+    """From the base to the sensor, and from the sensor to a landmark, along the axes of the map."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
+    return ox, oy, landmark[0] - x[0] - ox, landmark[1] - x[1] - oy
+
+
+@njit(error_model="numpy", nogil=True)
 def range_row(x, nuisance, model, data, q, at, row):
     """Whitened residual of the range of observation ``q`` from pose ``x``; returns its number of border columns."""
     jp, _, cols, vals = row
     g, sensor, p = model
     j, v = data.slots[q]
-    c, s = math.cos(x[2]), math.sin(x[2])
-    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
-    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
+    ox, oy, dx, dy = lever_and_offset(x, nuisance[j], sensor)
     r = math.sqrt(dx * dx + dy * dy + 1e-12)
     base = HEAD + 2 * at[j]
     grow, w = 1.0 + g[RANGE_SCALE], 1.0 / p[RANGE]
@@ -76,9 +82,7 @@ def bearing_row(x, nuisance, model, data, q, at, row):
     jp, _, cols, vals = row
     g, sensor, p = model
     j, v = data.slots[q]
-    c, s = math.cos(x[2]), math.sin(x[2])
-    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
-    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
+    ox, oy, dx, dy = lever_and_offset(x, nuisance[j], sensor)
     r2 = dx * dx + dy * dy + 1e-12
     base = HEAD + 2 * at[j]
     w = 1.0 / p[BEARING]

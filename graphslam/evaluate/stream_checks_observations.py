@@ -108,7 +108,7 @@ def _ranges_and_path(z: LandmarkObservations, name: str, log: SensorLog) -> list
         f"of observations (median factor {times:.3g}) — ranges are too long or in another unit, wheel distances too "
         "short, or ids wrong."
     )
-    return [Finding("bad", "ranges-and-way", text)]
+    return [Finding("bad", "ranges-and-path", text)]
 
 
 def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from graphslam.core.atomic import atomic_open, part_path
-from graphslam.core.errors import DataError
+from graphslam.core.atomic import atomic_open
 from graphslam.core.extras import import_extra
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
+from graphslam.core.output_folder import output_folder
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
 from graphslam.io.tum import embed_plane
 
 BagForm = Literal["mcap", "ros2"]
+KIND = "bag"
+"""See :func:`~graphslam.core.output_folder.check_folder_target`."""
 _FLAT = 0.02
 """Height of the ellipses of a planar map [m]."""
 
@@ -147,30 +148,19 @@ def write_bag(
 
     Raises
     ------
-    DataError
-        ``path`` is there and is not a bag.
+    OutputError
+        There is no place for the output.
     """
     target, rows = Path(path), sorted(records, key=lambda r: r.time)
     if form == "mcap":
         _write_mcap(target, rows, factory)
         return
-    if target.exists() and not (target / "metadata.yaml").is_file():
-        raise DataError("is there and is not a bag", where=str(target), wanted="a new name, or a bag to replace")
-    staged = part_path(target)
-    made, before = staged / "new" / target.name, staged / "before"  # the file in a bag has the name of its folder
-    try:
-        made.parent.mkdir(parents=True)
+    with output_folder(target, KIND, last=("metadata.yaml",)) as staged:
+        made = staged / target.name  # the file in a bag has the name of its folder
         _write_ros2(made, rows, factory)
-        if target.exists():
-            target.rename(before)
-        try:
-            made.rename(target)
-        except OSError:
-            if before.exists():
-                before.rename(target)
-            raise
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
+        for part in made.iterdir():
+            part.rename(staged / part.name)
+        made.rmdir()
 
 
 def _write_mcap(target: Path, records: Sequence[BagRecord], factory: MessageFactory) -> None:

@@ -14,7 +14,7 @@ from graphslam.app.export import export, map_points
 from graphslam.app.export_bag import loop_ends
 from graphslam.app.run.run import Run
 from graphslam.core import se3
-from graphslam.core.errors import DataError
+from graphslam.core.errors import OutputError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.io.bag_writer import ellipsoid, ros_covariances
@@ -202,7 +202,7 @@ def test_a_bag_is_swapped_whole_and_nothing_else_is_replaced(
     assert {p.name for p in bag.iterdir()} == before.keys()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
-    with pytest.raises(DataError, match="not a bag"):
+    with pytest.raises(OutputError, match=r"thesis\.tex; wanted a new or empty folder for the bag"):
         export(field, format="ros2", out=tmp_path / "mine")
 
     def broken(*_: Any) -> None:

@@ -121,12 +121,12 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
         usual = float(np.median(np.diff(motion.times[:known])))
         if spacing[i] > 3.0 * usual:
             gaps.append(i)
-            out.append(_gap(motion.take(slice(0, known)), float(stamps[i]), float(stamps[i + 1]), usual))
-    long = np.array([i for i in gaps if spacing[i] > limit], dtype=np.int64)
-    if isinstance(motion, Odometry):
-        refuse_unbridged(motion, long, limit, where, option=OPTION)
-    else:
-        refuse_long_gaps(stamps, long, limit, where, option=OPTION)
+            part, long = motion.take(slice(0, known)), np.array([k for k in gaps if spacing[k] > limit], dtype=np.int64)
+            if isinstance(part, Odometry):
+                refuse_unbridged(part, long, limit, where, option=OPTION)
+            else:
+                refuse_long_gaps(stamps, long, limit, where, option=OPTION)
+            out.append(_gap(part, float(stamps[i]), float(stamps[i + 1]), usual))
     return out
 
 

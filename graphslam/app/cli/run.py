@@ -183,7 +183,7 @@ def time_notes(report: Mapping[str, Any], submaps: int) -> list[str]:
 
 CAUSES = frozenset(
     {"residuals", "calibration", "observations-not-used", "motion-gap", "particles", "gps-mirrored", "gps-scale"}
-    | {"gps-correlated", "ranges-constant", "bearings-degrees", "steering-degrees", "scans-repeated", "ranges-and-way"}
+    | {"gps-correlated", "ranges-constant", "bearings-degrees", "steering-degrees", "scans-repeated", "ranges-and-path"}
 )
 """Codes of findings that explain disagreement between submaps."""
 

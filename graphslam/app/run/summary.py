@@ -51,7 +51,7 @@ ADVICE: dict[str, str] = {
     "imu-gravity": "correct the unit or the mounting of the IMU",
     "bearings-degrees": "give the bearings in radians",
     "steering-degrees": "give the steering angles in radians",
-    "ranges-and-way": "check the unit of the ranges",
+    "ranges-and-path": "check the unit of the ranges",
     "ranges-constant": "remove the constant ranges from the log",
     "scans-constant": "remove the constant scans from the log",
     "scans-repeated": "keep the first of the repeated scans only",
