@@ -221,3 +221,10 @@ def test_kernels_group_their_arrays() -> None:
 def test_studies_import_no_private_name(path: Path) -> None:
     ours = [i for i in imports(path) if i.startswith(("graphslam.", "graphslam_frontends."))]
     assert not [i for i in ours if any(part.startswith("_") for part in i.split("."))]
+
+
+def test_every_benchmark_has_a_quick_mode() -> None:
+    """``make bench`` runs each of them with ``--quick``."""
+    benchmarks = sorted((ROOT / "tests" / "benchmarks").glob("bench_*.py"))
+    assert benchmarks
+    assert not [b.name for b in benchmarks if '"--quick"' not in b.read_text()]
