@@ -67,7 +67,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for reports in terminalreporter.stats.values():
         for r in reports:
             if isinstance(r, pytest.TestReport):
-                spent[r.nodeid.split("::")[0]] += r.cpu  # type: ignore[attr-defined]
+                spent[r.nodeid.split("::")[0]] += getattr(r, "cpu", 0.0)  # it has none if its process died
     terminalreporter.section(f"CPU time of {len(spent)} files, {sum(spent.values()):.0f} s in all")
     for file, seconds in spent.most_common(40):
         terminalreporter.line(f"{seconds:7.1f} s  {file}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -12,6 +13,7 @@ import pytest
 
 from graphslam.core.interrupt import defer_interrupts
 from graphslam_studies.montecarlo.interrupt import watch_interrupts
+from tests.command_line import graphslam
 
 
 @pytest.fixture(autouse=True)
@@ -98,3 +100,11 @@ def test_other_threads_are_unaffected() -> None:
     thread.start()
     thread.join()
     assert seen == [1]
+
+
+def test_a_command_in_a_test_leaves_signals_as_they_were() -> None:
+    """Else the next Ctrl-C of this file, which a hook of the command repeats a moment later, ends the process."""
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM), sys.unraisablehook
+    assert graphslam("--version").returncode == 0
+    assert graphslam("solve", "missing.g2o").returncode == 1
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM), sys.unraisablehook) == before
