@@ -19,7 +19,6 @@ from graphslam.loops.candidates import (
     pairs_sharing_scans,
     proximity_candidates,
 )
-from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.graph_loops import GraphLoops, GraphSolver, chain_of_graph
 from graphslam.loops.loops import LoopCloser, LoopConfig
 from graphslam.loops.measure import LoopMeasurer
@@ -133,10 +132,7 @@ class LoopSearch:
         p = ours.places
         if self.closer is None or self._measurer is None:
             self._measurer = m = LoopMeasurer(submaps, p, c.pairs)
-            chain = chain_of_graph(graph)
-            self.closer = LoopCloser(
-                ours, *chain, c.decisions, judge=truncated_least_squares_inliers, map_check=m.contradictions
-            )
+            self.closer = LoopCloser(ours, *chain_of_graph(graph), c.decisions, map_check=m.contradictions)
         closer, measurer = self.closer, self._measurer
         closer.extend_chain(ours, *chain_of_graph(graph))
         measurer.extend_chain(submaps, p)

@@ -8,8 +8,8 @@ One wrong loop ruins a map, so a loop must pass these tests, in this order:
 3. the χ² of its residual with the current joint marginal of the graph, most likely loops first;
 4. the solution: a loop that raises the χ² of earlier factors significantly is removed, and after all loops were added,
    each is compared with the graph *without* it;
-5. if a group excludes a larger set of consistent loops, the two are exchanged, by pairwise consistency and by a joint
-   test of all loops;
+5. if a joint test of all loops keeps more loops than the graph has, they are exchanged
+   (:mod:`~graphslam.loops.global_inlier_check`);
 6. of two contradictory groups the one with the more consistent map overlap is accepted
    (:mod:`~graphslam.loops.map_overlap_test`); if the maps do not decide, the one that agrees better with the rest of
    the graph; if this is ambiguous, neither (:mod:`~graphslam.loops.conflicting_groups`).
@@ -38,15 +38,15 @@ from graphslam.loops.conflicting_groups import (
     AMBIGUOUS,
     CLASH,
     LOST,
-    SHUTS_OUT,
     choose_group,
     find_conflicting_groups,
 )
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.ledger import LoopDecision, LoopLedger, Verdict
 from graphslam.loops.map_overlap_test import MapCheck, disagreement_shares, overlap_log_likelihood_ratio
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.loops.rules import Judge, LoopConfig, LoopGraph, chi2_without
+from graphslam.loops.rules import JointTest, LoopConfig, LoopGraph, chi2_without
 from graphslam.registration.submap_pairs import prediction_chi2
 
 
@@ -59,7 +59,7 @@ class LoopCloser:
         The chain alone, between nodes, right tangents, for pairwise consistency.
     ledger : LoopLedger, optional
         Earlier ledger to continue.
-    judge : callable, optional
+    joint_test : callable
         Joint inlier test of all loops, from increments, covariances, and loops (ends, poses, covariances) to a mask
         (:func:`graphslam.loops.global_inlier_check.truncated_least_squares_inliers`).
     map_check : callable, optional
@@ -74,14 +74,14 @@ class LoopCloser:
         covariances: Array,
         config: LoopConfig | None = None,
         ledger: LoopLedger | None = None,
-        judge: Judge | None = None,
+        joint_test: JointTest = truncated_least_squares_inliers,
         map_check: MapCheck | None = None,
     ) -> None:
         self.graph = graph
         self.increments, self.covariances = increments, covariances
         self.config = LoopConfig() if config is None else config
         self.ledger = LoopLedger() if ledger is None else ledger
-        self.judge, self.map_check = judge, map_check
+        self.joint_test, self.map_check = joint_test, map_check
         self.loops: dict[int, Loop] = {}
         self._torn: list[tuple[list[int], list[int]]] = []
         self._dof = group_of(increments).dof
@@ -163,9 +163,7 @@ class LoopCloser:
             if not refused:
                 break
             out |= refused
-        if self._exchange():
-            self._reconsider()
-        if self._second_opinion():
+        if self._joint_test():
             self._reconsider()
         seen: list[list[int]] = []
         while self.accepted not in seen:  # removing one group may start a dispute with the next one
@@ -243,31 +241,13 @@ class LoopCloser:
         weight = float(self._kernel().weight(np.array([after[fid]]))[0])
         return "accepted", acceptance_reason(expected, d), {**facts, "factor_id": fid, "weight": weight}
 
-    def _exchange(self) -> bool:
-        """Exchange loops in the graph with a larger set of consistent loops that they exclude.
-
-        Pairs are compared along the chain, which may have a large covariance. So loops that are pairwise consistent may
-        still not fit into one graph together with a wrong group, and are rejected one by one.
-        """
-        inside, outside = self.accepted, self._refused_by_company()
-        outside = [n for n in outside if self._bears(n)]
-        if not inside or len(outside) < 2:
-            return False
-        agreed = self._consistent(outside).accepted
-        outside = [n for n, good in zip(outside, agreed) if good]
-        both = self._consistent([*inside, *outside])
-        clash = both.chi2[: len(inside), len(inside) :] > both.limit
-        # correct pairs are sometimes inconsistent by chance: rivals exclude many loops
-        rivals = [n for n, row in zip(inside, clash) if row.mean() > SHUTS_OUT]
-        return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
-
-    def _second_opinion(self) -> bool:
-        """Joint test of all loops, independent of their order."""
+    def _joint_test(self) -> bool:
+        """Test all loops together, independent of their order; exchange those in the graph for more that it keeps."""
         inside = self.accepted
         asked = sorted({*inside, *(n for n in self._refused_by_company() if self._bears(n))})
-        if self.judge is None or not inside or len(asked) < 2:
+        if not inside or len(asked) < 2:
             return False
-        good = self.judge(self.increments, self.covariances, self._arrays(asked))
+        good = self.joint_test(self.increments, self.covariances, self._arrays(asked))
         believed = {n for n, yes in zip(asked, good) if yes}
         rivals, outside = [n for n in inside if n not in believed], sorted(believed - set(inside))
         return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)

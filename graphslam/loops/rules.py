@@ -18,7 +18,7 @@ from graphslam.graph.noise import RobustKernel
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 
-Judge = Callable[[Array, Array, tuple[Ints, Array, Array]], npt.NDArray[np.bool_]]
+JointTest = Callable[[Array, Array, tuple[Ints, Array, Array]], npt.NDArray[np.bool_]]
 """See :class:`~graphslam.loops.loops.LoopCloser`."""
 
 

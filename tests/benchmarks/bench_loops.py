@@ -29,7 +29,6 @@ from graphslam.evidence.views import dense_view
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.map_overlap_test import MapCheck
 from graphslam.loops.measure import Loop, LoopMeasurer
@@ -113,9 +112,7 @@ def closed(
     chain: ChainRelativePoses, loops: list[Loop], map_check: MapCheck | None = None
 ) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
-    closer = LoopCloser(
-        net, chain.increments, chain.covariances, judge=truncated_least_squares_inliers, map_check=map_check
-    )
+    closer = LoopCloser(net, chain.increments, chain.covariances, map_check=map_check)
     closer.propose(loops)
     return net, closer
 

@@ -58,7 +58,7 @@ def test_a_second_opinion_changes_what_was_taken_only_for_more_loops() -> None:
                          for e, z in zip(loops[0].tolist(), loops[1])])  # fmt: skip
 
     right_at = {(x.i, x.j): x.T_ij for x in right}
-    closer = LoopCloser(LoopNetwork(T, P), T, P, judge=judge)
+    closer = LoopCloser(LoopNetwork(T, P), T, P, joint_test=judge)
     first = [d.loop for d in closer.propose(wrong)]
     assert closer.accepted == first  # nothing better is there
     closer.propose(right)
@@ -66,7 +66,7 @@ def test_a_second_opinion_changes_what_was_taken_only_for_more_loops() -> None:
     assert not set(first) & set(closer.accepted)
     assert len(closer.accepted) == 4
     # a judge that believes none changes nothing
-    stubborn = LoopCloser(LoopNetwork(T, P), T, P, judge=lambda t, p, x: np.zeros(len(x[0]), bool))
+    stubborn = LoopCloser(LoopNetwork(T, P), T, P, joint_test=lambda t, p, x: np.zeros(len(x[0]), bool))
     stubborn.propose(right)
     assert len(stubborn.accepted) == 4
 

@@ -11,7 +11,6 @@ import pytest
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.loops.conflicting_groups import choose_group
-from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.map_overlap_test import ERROR, FEWEST, disagreement_shares, overlap_log_likelihood_ratio
 from graphslam.loops.measure import Loop
@@ -87,7 +86,7 @@ def test_one_right_loop_stands_against_three_wrong_ones_by_what_the_maps_say() -
     outcomes = []
     for asked in (None, map_check):
         T, P = chain_of(poses, np.random.default_rng(7))
-        closer = LoopCloser(LoopNetwork(T, P), T, P, judge=truncated_least_squares_inliers, map_check=asked)
+        closer = LoopCloser(LoopNetwork(T, P), T, P, map_check=asked)
         closer.propose([*calm, *wrong])
         (d,) = closer.propose([one])
         outcomes.append((len(closer.accepted), d.verdict))
