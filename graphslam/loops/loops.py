@@ -163,7 +163,7 @@ class LoopCloser:
             if not refused:
                 break
             out |= refused
-        if self._joint_test():
+        if self._exchange_by_joint_test():
             self._reconsider()
         seen: list[list[int]] = []
         while self.accepted not in seen:  # removing one group may start a dispute with the next one
@@ -241,8 +241,8 @@ class LoopCloser:
         weight = float(self._kernel().weight(np.array([after[fid]]))[0])
         return "accepted", acceptance_reason(expected, d), {**facts, "factor_id": fid, "weight": weight}
 
-    def _joint_test(self) -> bool:
-        """Test all loops together, independent of their order; exchange those in the graph for more that it keeps."""
+    def _exchange_by_joint_test(self) -> bool:
+        """Exchange loops in the graph for others, if a test of all together, in no order, keeps more than there are."""
         inside = self.accepted
         asked = sorted({*inside, *(n for n in self._refused_by_company() if self._bears(n))})
         if not inside or len(asked) < 2:
