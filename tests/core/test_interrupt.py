@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -17,11 +16,9 @@ from tests.command_line import graphslam
 
 
 @pytest.fixture(autouse=True)
-def pythons_handler() -> Iterator[None]:
+def pythons_handler() -> None:
     """Tests that run in the background of a shell would find Ctrl-C ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def press() -> None:
