@@ -109,16 +109,6 @@ PACKAGE_NAMES = NAMES | {
     **dict.fromkeys(("way", "ways"), "path, route, length, variant"),
 }
 """Outside the tests."""
-PUBLIC_NAMES = {
-    "says": ("data.py", "reader.py"),
-    "loop_ties": ("back_end.py", "config.py"),
-    "ties": ("back_end.py", "find_loops.py", "segments.py", "segmap_trial.py"),
-    "way": ("solid.py",),
-    "ways": ("imu.py", "calibration.py", "calibration_trial.py"),
-    "least_way": ("appearance.py", "candidates.py", "overlap_constraints.py"),
-    "hidden_way": ("campus_config.py",),
-}
-"""Names that users write or read in files (options, parameters, events), and the files with them."""
 _PARTS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _COMPILED = {re.compile(p, re.IGNORECASE): plain for p, plain in PATTERNS.items()}
 _CODE = re.compile(r"``[^`]*``|`[^`\n]*`|\]\([^)\n]*\)|^ *(>>>|\.\.\.) .*$|\b\w+\.[\w{][^\s,;)]*", re.M)
@@ -227,7 +217,6 @@ def test_names_are_plain() -> None:
             source = path.read_text(encoding="utf-8")
             if path != Path(__file__) and any(idiom in source.lower() for idiom in idioms):
                 rows = idioms_in_names(source, idioms)
-                rows = [row for row in rows if path.name not in PUBLIC_NAMES.get(row.split()[1], ())]
                 found |= {str(path.relative_to(ROOT)): rows} if rows else {}
     assert not found, "private idioms in names:\n" + "\n".join(f"{name}: {rows}" for name, rows in found.items())
 

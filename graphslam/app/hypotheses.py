@@ -200,7 +200,7 @@ def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence
     inputs, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
     if inputs is None or inputs.scans is None:
         return found
-    check_same((folder / "run.json", run.report.get("generation")), (folder / "taken.npz", generation))
+    check_same((folder / "run.json", run.report.get("generation")), (folder / "inputs.npz", generation))
     solution = found.choice.best.alternative.solution
     solved = make_global_map(solution, list(submaps), {}, 1)
     gps = None
@@ -227,7 +227,7 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
     feed: RecordSource | None = None
     if imu.use != "none" and run.folder is not None:
         inputs, generation = read_consistently(run.folder, read_inputs)
-        check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
+        check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "inputs.npz", generation))
         feed = RecordSource(inputs.log)
     if run.folder is None and "control_points" in run.report:
         raise MissingDataError("only its folder holds the control points of a run", wanted="a run with out=…")

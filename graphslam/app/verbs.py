@@ -144,7 +144,7 @@ def open_run(path: str | Path) -> Run:
 
     @cache
     def solved() -> tuple[Any, Any]:
-        return resolve_from_folder(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
+        return resolve_from_folder(path) if (run.folder / "inputs.npz").is_file() else (None, None)  # type: ignore[operator]
 
     def fused() -> Any:
         try:

@@ -30,7 +30,7 @@ from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
 from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_events, same_loop
-from graphslam.loops.overlap_constraints import OverlapConfig, overlap_entries
+from graphslam.loops.overlap_constraints import overlap_entries
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
@@ -50,7 +50,6 @@ def find_config(c: BackEndConfig) -> FindConfig:
         candidates=CandidateConfig(overlap=LOOP_OVERLAP, height=LOOP_HEIGHT, least_support=c.match_support),
         appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
-        ties=OverlapConfig() if c.loop_ties else None,
         rounds=FindConfig().rounds if c.looks else 0,
     )
 

@@ -208,7 +208,7 @@ def connect_session(
         found = two, two.find(c, progress=progress)
     two, loops = found
     if loops.why:
-        raise DataError(f"no tie to {known.name}: {loops.why}", where=new.name)
+        raise DataError(f"no link to {known.name}: {loops.why}", where=new.name)
     start = session_start(loops.chosen, graph.values.poses[known_node:], new.chain)
     node = add_session(graph, new, start)
     apart = two.thinned(loops.chosen, CandidateConfig().stretch)

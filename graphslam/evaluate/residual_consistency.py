@@ -31,7 +31,7 @@ CORRELATED = "correlated: overconfident"
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing alone: points of a path exist for fixes or control points, and share their residuals.
 They are counted with the first of these classes that the graph has."""
-NOT_TESTED = {"tie": 0, "levelled": 2}
+NOT_TESTED = {"overlap": 0, "levelled": 2}
 """Classes of pseudo-measurements of poses or gravity that other factors contain already: their residuals are always
 small. The value is the number of unknowns that only the class determines: for levelled bases the tilt of the frame."""
 LONGEST_SERIES = 1200

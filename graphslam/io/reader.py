@@ -23,7 +23,7 @@ class Reader:
 
     Parameters
     ----------
-    says : str
+    reads : str
         Description of its sources, in one line.
     target : str
         ``module:function``; the function takes the path, and options as keyword arguments with annotations. Imported
@@ -39,7 +39,7 @@ class Reader:
         Name of the default preset for its sources, if there is none for the name of the log.
     """
 
-    says: str
+    reads: str
     target: str
     recognise: Callable[[SourceProbe], ReaderMatch | None]
     parts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

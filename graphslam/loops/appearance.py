@@ -27,7 +27,7 @@ class AppearanceConfig:
     """Minimum correlation of descriptors …"""
     lead: float = 0.05
     """… and its minimum lead over the next stretch: if many places look the same, none is a candidate."""
-    least_way: float = 30.0
+    least_path: float = 30.0
     """Minimum path length between the two places [m]."""
     stretch: float = 12.0
     """Places with a smaller distance along the path are in one stretch [m]."""
@@ -41,7 +41,7 @@ class AppearanceConfig:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not math.isfinite(value) or value < 0 or (value == 0 and f.name not in ("lead", "least", "least_way")):
+            if not math.isfinite(value) or value < 0 or (value == 0 and f.name not in ("lead", "least", "least_path")):
                 raise ConfigError(f"loop candidates by appearance: {f.name} = {value}; wanted a positive number")
 
 
@@ -77,10 +77,10 @@ def appearance_candidates(
     covariance = _covariance(c, g.dim)
     found: list[LoopCandidate] = []
     for j in range(len(places)):
-        if places.arc[j] < c.least_way:
+        if places.arc[j] < c.least_path:
             continue
         rows = np.sort(tree.query(keys[j], min(descriptors.config.shortlist, len(places)))[1]).astype(np.int64)
-        usable = places.arc[j] - places.arc[rows] >= c.least_way
+        usable = places.arc[j] - places.arc[rows] >= c.least_path
         usable &= places.submap[rows] != places.submap[j]
         usable &= [tuple(sorted((int(s), int(places.submap[j])))) not in shut for s in places.submap[rows]]
         rows = rows[usable]

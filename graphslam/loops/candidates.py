@@ -24,7 +24,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.loops.places import Ints, Places, RelativePoses
 
-FRONT_END, PROXIMITY, APPEARANCE, OVERLAP = "front-end", "proximity", "appearance", "tie"
+FRONT_END, PROXIMITY, APPEARANCE, OVERLAP = "front-end", "proximity", "appearance", "overlap"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +37,7 @@ class CandidateConfig:
     """… and their height difference not larger than this, because levels of a building look alike [m]."""
     sigmas: float = 2.5
     """A pair is a candidate if it may be within these limits by this many σ of its relative pose."""
-    least_way: float = 30.0
+    least_path: float = 30.0
     """Minimum path length between the two places: nearer ones share scans or are neighbours [m]."""
     least_gain: float = 2.0
     """Minimum expected information gain of a match [nat]."""
@@ -59,7 +59,7 @@ class CandidateConfig:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            zero = f.name in ("least_way", "least_gain", "least_support", "stretch")
+            zero = f.name in ("least_path", "least_gain", "least_support", "stretch")
             if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
                 raise ConfigError(f"loop candidates: {f.name} = {value}; wanted a number {'≥' if zero else '>'} 0")
 
@@ -73,7 +73,7 @@ class LoopCandidate:
     i, j : int
         Places, ``i`` before ``j`` along the path: the map of i's submap is the target, the view from j the source.
     source : str
-        ``front-end``, ``proximity``, ``appearance``, ``tie`` (:mod:`~graphslam.loops.overlap_constraints`).
+        ``front-end``, ``proximity``, ``appearance``, ``overlap`` (:mod:`~graphslam.loops.overlap_constraints`).
     T_ij : (7,) or (3,)
         The prediction; for a front-end match or an overlap constraint the measurement itself.
     covariance : (d, d)
@@ -157,7 +157,7 @@ def proximity_candidates(
     c = CandidateConfig() if config is None else config
     n = len(places)
     first, second = np.triu_indices(n, 1)
-    far = places.arc[second] - places.arc[first] >= c.least_way
+    far = places.arc[second] - places.arc[first] >= c.least_path
     # places of one submap are no pair: the map would be matched with itself
     far &= (places.submap[first] != places.submap[second]) & (places.submap[second] >= since)
     if exclude:

@@ -46,7 +46,7 @@ class FindConfig:
     """Descriptors of places for appearance."""
     front_end: bool = False
     """Include the front end's matches; not if they are factors of the graph already."""
-    ties: OverlapConfig | None = field(default_factory=OverlapConfig)
+    overlaps: OverlapConfig | None = field(default_factory=OverlapConfig)
     """Overlap constraints along submaps that continued in an older map (with ``front_end``: by accepted matches); None:
     off. They are added last, and removed together with the match that they depend on."""
     rounds: int = 3
@@ -157,8 +157,8 @@ class LoopSearch:
         self._seen = len(submaps)
         if last:
             self._look_alike(p, shared, tried, go)
-            if c.ties is not None and c.front_end:
-                go(overlap_candidates(submaps, p, _believed(closer), c.ties))
+            if c.overlaps is not None and c.front_end:
+                go(overlap_candidates(submaps, p, _believed(closer), c.overlaps))
                 _drop_orphans(closer)
             measurer.forget()
         logger.info("loops: %s", closer.ledger.counts() or "no candidates")

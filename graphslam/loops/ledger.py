@@ -54,7 +54,7 @@ class LoopDecision:
     submap_i, submap_j : int
         Keys of their submaps.
     source : str
-        Source of the candidate: ``front-end``, ``proximity``, ``appearance`` or ``tie``.
+        Source of the candidate: ``front-end``, ``proximity``, ``appearance`` or ``overlap``.
     score, gain : float
         Of the candidate.
     gates : dict

@@ -42,7 +42,7 @@ class OverlapConfig:
     """The body is near an earlier part of the path if the distance is smaller than this [m] …"""
     height: float = 1.25
     """… and the height difference not larger than this [m]."""
-    least_way: float = 12.0
+    least_path: float = 12.0
     """Minimum path length before a revisit within the same submap counts [m]."""
     sigma: float = 0.08
     """σ of an overlap constraint along and across [m] …"""
@@ -55,7 +55,7 @@ class OverlapConfig:
         for f in fields(self):
             value = getattr(self, f.name)
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"ties: {f.name} = {value}; wanted a number > 0")
+                raise ConfigError(f"overlap constraints: {f.name} = {value}; wanted a number > 0")
 
     def covariance(self, group: Group) -> Array:
         """Of an overlap constraint ``(d, d)``, right tangent."""
@@ -148,7 +148,7 @@ def _beside(places: Places, j: int, seen: _Seen, c: OverlapConfig) -> tuple[int,
     for u, (T_u_base, by) in seen.items():
         T_u_j = g.compose(T_u_base, T_j)
         at = places.of_submap(u)
-        at = at[places.arc[j] - places.arc[at] >= c.least_way]
+        at = at[places.arc[j] - places.arc[at] >= c.least_path]
         d = places.T_base_node[at, : g.dim] - T_u_j[: g.dim]
         near = np.hypot(d[:, 0], d[:, 1])
         if g.dim == 3:

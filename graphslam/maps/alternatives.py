@@ -23,7 +23,7 @@ from graphslam.maps.fuse import FusedMap
 from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy
 from graphslam.solve.solution import Solution
 
-CONSTRAINTS = ("match", "loop", "tie")
+CONSTRAINTS = ("match", "loop", "overlap")
 """Classes of factors that close loops."""
 
 

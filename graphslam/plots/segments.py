@@ -38,7 +38,7 @@ def plot_segments(
     ax: Axes | None,
     paths: Sequence[Path],
     *,
-    ties: Sequence[DrawnMatch] = (),
+    matches: Sequence[DrawnMatch] = (),
     labels: Sequence[str] | None = None,
     truth: Path | None = None,
     plane: str = "xy",
@@ -50,7 +50,7 @@ def plot_segments(
     ----------
     paths : sequence of Trajectory or (n, dim)
         In one frame and in the order of time; :func:`sample_paths` makes them from a map sample.
-    ties : sequence of DrawnMatch
+    matches : sequence of DrawnMatch
         Matches.
     labels : sequence of str, optional
         Text at the start of each; default its number.
@@ -72,10 +72,10 @@ def plot_segments(
                 mec="white", mew=0.5, zorder=4)  # fmt: skip
         ax.annotate(str(k) if labels is None else labels[k], (p[0, i], p[0, j]), xytext=(4, 4),
                     textcoords="offset points", fontsize="x-small", color=style.BLACK, zorder=6)  # fmt: skip
-    for k, match in enumerate(ties):
+    for k, match in enumerate(matches):
         here, there = np.asarray(match.here), np.asarray(match.there)
         ax.plot([here[i], there[i]], [here[j], there[j]], color=style.BLACK, lw=1.2, marker="o", ms=5.0, mfc="none",
-                label=f"matches ({len(ties)})" if k == 0 else None, zorder=5)  # fmt: skip
+                label=f"matches ({len(matches)})" if k == 0 else None, zorder=5)  # fmt: skip
     style.metric_axes(ax, *plane)
     finish_plan(ax, title)
     return ax

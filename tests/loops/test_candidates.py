@@ -113,7 +113,7 @@ def plain_pairs(places: Places, chain: ChainRelativePoses, c: CandidateConfig) -
     out = set()
     for i in range(len(places)):
         for j in range(i + 1, len(places)):
-            if places.arc[j] - places.arc[i] < c.least_way or places.submap[i] == places.submap[j]:
+            if places.arc[j] - places.arc[i] < c.least_path or places.submap[i] == places.submap[j]:
                 continue
             T, P = chain(np.array([i]), np.array([j]))
             R = se3.quat_to_matrix(T[0, 3:])
@@ -134,7 +134,7 @@ def test_proximity_gives_the_pairs_that_may_overlap() -> None:
     chain = ChainRelativePoses(submaps, places)
     for c in (
         CandidateConfig(stretch=0.0, keep=10_000, batch=37),
-        CandidateConfig(stretch=0.0, keep=10_000, overlap=3.0, least_gain=4.0, least_way=60.0),
+        CandidateConfig(stretch=0.0, keep=10_000, overlap=3.0, least_gain=4.0, least_path=60.0),
     ):
         found = proximity_candidates(places, chain, c)
         assert {(x.i, x.j) for x in found} == plain_pairs(places, chain, c)

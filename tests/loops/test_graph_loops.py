@@ -115,11 +115,11 @@ def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
     for i in range(3, 13):
         j = i + 10
         T = group_of(x).between(x[i], x[j])
-        ours.add_loop(replace(loop_of(poses[::3], i, j, rng), T_ij=T, source="tie"), RobustKernel())
+        ours.add_loop(replace(loop_of(poses[::3], i, j, rng), T_ij=T, source="overlap"), RobustKernel())
     classes = class_consistency(ours.graph)
-    assert set(classes) == {"dense-submap", "loop", "tie"}
-    assert classes["tie"].as_row()["verdict"] == "not tested"
-    assert classes["tie"].factors == 10
+    assert set(classes) == {"dense-submap", "loop", "overlap"}
+    assert classes["overlap"].as_row()["verdict"] == "not tested"
+    assert classes["overlap"].factors == 10
     out = Metrics()
     solution_metrics(out, ours.solver.solution(), 0)
     keys = {r["key"] for r in out.rows}
@@ -130,8 +130,8 @@ def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
     assert whole is not None
     assert whole[1] == pytest.approx(sum(c.dof for c in alone.values()), abs=1e-6)
     # no test of covariances is made of them; of the same residuals of a class that measures, one is
-    for name, tested in (("tie", False), ("loop", True)):
-        found = ResidualConsistency({name: replace(classes["tie"], name=name)}, None, None).evidence([])
+    for name, tested in (("overlap", False), ("loop", True)):
+        found = ResidualConsistency({name: replace(classes["overlap"], name=name)}, None, None).evidence([])
         assert any(t.name == f"χ² of {name}" for t in found) == tested
 
 

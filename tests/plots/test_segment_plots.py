@@ -72,7 +72,7 @@ def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> No
         np.testing.assert_allclose(back[:, :2], there, atol=1e-12)
     with pytest.raises(ConfigError, match="frame"):
         sample_paths(m, sample, frame="last")  # type: ignore[arg-type]
-    ax = plot_segments(None, paths, ties=matches, labels=labels, truth=whole)
+    ax = plot_segments(None, paths, matches=matches, labels=labels, truth=whole)
     assert "matches (1)" in texts(ax)
     assert {t.get_text() for t in ax.texts} == set(labels)
     np.testing.assert_allclose(ax.lines[1].get_xydata(), paths[0])
@@ -83,7 +83,7 @@ def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> No
 
 def test_other_planes_and_impossible_ones() -> None:
     p = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
-    ax = plot_segments(None, [p], ties=[DrawnMatch(p[0], p[1])], plane="xz")
+    ax = plot_segments(None, [p], matches=[DrawnMatch(p[0], p[1])], plane="xz")
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), p[:, [0, 2]])
     assert ax.get_ylabel() == "z [m]"
     with pytest.raises(DataError, match="cannot be drawn"):

@@ -49,13 +49,13 @@ def test_views_keep_lengths_and_point_the_right_way() -> None:
 
 def test_the_lid_comes_off_and_the_tower_stands_where_it_is() -> None:
     view = ViewDirection(azimuth=-np.pi / 2, elevation=np.pi / 2)
-    cut = plot_solid(boxes(), below=3.5, view=view, margin=3.0, pixels=160, way=False)
+    cut = plot_solid(boxes(), below=3.5, view=view, margin=3.0, pixels=160, route=False)
     a, at = picture(cut)
     tower = (at[..., 0] > 4.2) & (at[..., 0] < 5.8) & (at[..., 1] > -1.8) & (at[..., 1] < -1.2)
     floor = (at[..., 1] > 0.5) & (at[..., 1] < 2.5) & (at[..., 0] > -2.0) & (at[..., 0] < 12.0)
     assert a[tower][:, :3].mean() < a[floor][:, :3].mean() - 0.1  # darker: higher
     assert np.ptp(a[floor][:, :3], axis=0).max() < 0.02  # one flat floor
-    lid, at = picture(plot_solid(boxes(), below=4.5, view=view, margin=3.0, pixels=160, way=False))
+    lid, at = picture(plot_solid(boxes(), below=4.5, view=view, margin=3.0, pixels=160, route=False))
     inside = (np.abs(at[..., 1]) < 2.5) & (at[..., 0] > -2.5) & (at[..., 0] < 12.5)
     assert np.ptp(lid[inside][:, :3], axis=0).max() < 0.02  # nothing but the lid
     plt.close("all")

@@ -77,7 +77,7 @@ def readers_command(
     from graphslam.io.readers import find_reader, list_readers
 
     if name is None:
-        rows = [{"name": n, "reads": r.says} for n, r in list_readers().items()]
+        rows = [{"name": n, "reads": r.reads} for n, r in list_readers().items()]
         print_result({"readers": rows}, text_table(rows), as_json=as_json)
         return
     r = find_reader(name)
@@ -85,8 +85,8 @@ def readers_command(
         {"option": o.name, "type": str(o.annotation), "default": None if o.default is None else str(o.default)}
         for o in r.options().values()
     ]
-    value = {"name": name, "reads": r.says, "options": options}
-    print_result(value, f"{name}: {r.says}\n{text_table(options, ['option', 'type', 'default'])}", as_json=as_json)
+    value = {"name": name, "reads": r.reads, "options": options}
+    print_result(value, f"{name}: {r.reads}\n{text_table(options, ['option', 'type', 'default'])}", as_json=as_json)
 
 
 @app.command("fetch")

@@ -41,7 +41,7 @@ OWNED = (
     *("run.json", "merge.json", "metrics.json", "timings.json", "events.jsonl", "ledger.csv", "landmarks.csv"),
     *("map.npz", "merged.npz", "association.npz", "graph.g2o", "graph.npz"),
     *("trajectory.tum", "trajectory_*.tum", "nodes.tum"),
-    *("truth.npz", "truth.tum", "dead_reckoning.tum", "gps_*.npz", "fixes.npz", "taken.npz", "scans.npz"),
+    *("truth.npz", "truth.tum", "dead_reckoning.tum", "gps_*.npz", "fixes.npz", "inputs.npz", "scans.npz"),
     *("inputs/*.npz", "inputs/log.json", "fused_map.json", "map.ply", "map.bt", "cloud.ply", "map.pgm", "map.yaml"),
     *("map-*.pgm", "map-*.yaml"),
     *("map.grid.npz", "map.kml", "map.geojson", "clearest.*", "clearest-*", "alternatives/*.tum", "alternatives/*.g2o"),

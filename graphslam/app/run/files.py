@@ -272,7 +272,7 @@ def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dic
 def check_state(root: Path) -> None:
     """Check that plain files of a run have the same generation id; files of older versions have none."""
     known = read_report(root).get("generation")
-    for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "taken.npz")):
+    for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "inputs.npz")):
         if file.is_file():
             check_same((root / "run.json", known), (file, generation_of(read_arrays(file))))
     for file in sorted(root.glob("gps_*.npz")):

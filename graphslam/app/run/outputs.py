@@ -66,7 +66,7 @@ SAME_BYTES = (
     *("landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "graph.npz", "trajectory.tum", "nodes.tum"),
     *("truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
+    *("gps_*.npz", "fixes.npz", "inputs.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
     *("two_maps/*",),
     *("scans.npz", "trajectory_graph.tum", "refined/*", "figures/refined.png"),
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),

@@ -1,7 +1,7 @@
 """Inputs of a run besides its submaps, from which its graph, metrics and files can be made again without the log.
 
 Fixes, used and withheld, IMUs, motion and ground truth are kept unchanged; of streams that only the front end reads,
-only the time stamps. In a run folder: ``inputs/`` (a log, :mod:`graphslam.io.log_store`) and ``taken.npz``.
+only the time stamps. In a run folder: ``inputs/`` (a log, :mod:`graphslam.io.log_store`) and ``inputs.npz``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.io.log_store import INDEX_NAME, load_log, save_log
 from graphslam.refine.scans import Scans
 
-INPUTS_FORMAT = "graphslam.taken/1"
+INPUTS_FORMAT = "graphslam.graph-inputs/1"
 INPUTS = "inputs"
 SCANS = "scans.npz"
 KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls)
@@ -112,20 +112,20 @@ def write_inputs(folder: Path, inputs: RunInputs, generation: str) -> None:
     arrays["noticed"] = np.array(rows, "U").reshape(-1, 4)
     if inputs.identities is not None:
         arrays["identities"] = inputs.identities
-    write_npz(folder / "taken.npz", arrays)
+    write_npz(folder / "inputs.npz", arrays)
     if inputs.scans is not None:
         inputs.scans.save(folder / SCANS)
 
 
 def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
     """Read the inputs, and the id of their generation."""
-    if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
+    if not (folder / "inputs.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
         raise MissingDataError(
-            "the run folder has no inputs of its graph (taken.npz, inputs/)",
+            "the run folder has no inputs of its graph (inputs.npz, inputs/)",
             where=str(folder),
             wanted="a run of this version; run it again with --resume, finished submaps are reused",
         )
-    log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=INPUTS_FORMAT)
+    log, a = load_log(folder / INPUTS), read_npz(folder / "inputs.npz", fmt=INPUTS_FORMAT)
     try:
         streams: dict[str, Any] = {
             str(n): TimestampsOnly(a[f"times_{k}"]) if f"times_{k}" in a else log.streams[str(n)]
@@ -133,7 +133,7 @@ def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
         }
         rows = [(str(s), Finding.from_row(dict(zip(("level", "code", "text"), map(str, r))))) for s, *r in a["noticed"]]
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"stream or array {error} is missing", where=str(folder / "taken.npz")) from None
+        raise FormatError(f"stream or array {error} is missing", where=str(folder / "inputs.npz")) from None
     noticed = tuple(StreamFinding(stream, finding) for stream, finding in rows if finding is not None)
     scans = Scans.load(folder / SCANS, log.name) if (folder / SCANS).is_file() else None
     return RunInputs(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)

@@ -154,7 +154,7 @@ class ImuFactors(SensorFactors):
         if not more:
             mine = [r for r in self.graph.records.values() if getattr(r, "stream", None) == stream]
             self.graph.log_event(
-                "imu", stream=stream, factors=len(mine), ways=sum(isinstance(r, ImuRecord) for r in mine),
+                "imu", stream=stream, factors=len(mine), preintegrated=sum(isinstance(r, ImuRecord) for r in mine),
                 gravity=sum(isinstance(r, ForceRecord) for r in mine), dropped=dict(plan.dropped),
             )  # fmt: skip
         return ids

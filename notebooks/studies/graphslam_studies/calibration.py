@@ -10,7 +10,7 @@ Quantities
 ``…_ratio``: estimated over true σ; ``…_error``: estimated minus true constant (rad/s, a factor, s, m, rad); ``path``,
 ``landmarks`` [m]; ``nees_poses``, ``nees_landmarks`` per degree of freedom; ``join_chi2_per_dof``.
 Of scans: ``relations``: error of relative poses of random pairs [m]; ``…_input``: that of the input odometry;
-``input_told``: the verdict reports that the input is better; ``worse_untold``: the path error is more than 10 % larger
+``input_reported``: the verdict reports that the input is better; ``worse_unreported``: the path error is 10 % larger
 than that of the input, without such a report. Planted errors: ``within``: true value within 3σ of the estimate;
 ``corrected``; ``strength``: error/σ; ``false``: number of other constants that were corrected.
 Algorithms: ``stated``, ``calibrated``, ``oracle``, ``preset``; of scans as in
@@ -41,9 +41,9 @@ WORLDS |= {
 }
 WORLDS |= {
     name: CalibrationTrialConfig(
-        source=name, added=None, first=600.0, presets=f"{name}.segslam", frontend="segslam", ways=ways
+        source=name, added=None, first=600.0, presets=f"{name}.segslam", frontend="segslam", motions=motions
     )
-    for names, ways in (
+    for names, motions in (
         (("radish-intel", "radish-fr079", "radish-mit-csail"), ("preset", "calibrated")),
         (("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall"), ("recorded", "calibrated")),
     )
@@ -57,7 +57,7 @@ QUICK_WORLDS = {
 PLANTED_FIGURES = ("within", "corrected", "strength", "false", "false_clock", "normalised_error")
 MAPS = (
     *("path", "landmarks", "nees_poses", "nees_landmarks", "join_chi2_per_dof"),
-    *("relations", "relations_input", "path_input", "input_told", "worse_untold", "calibration_refused"),
+    *("relations", "relations_input", "path_input", "input_reported", "worse_unreported", "calibration_refused"),
 )
 
 
@@ -92,7 +92,7 @@ def maps_table(table: pd.DataFrame) -> pd.DataFrame:
 def found_table(table: pd.DataFrame) -> pd.DataFrame:
     """Median, minimum, maximum and RMS over the runs of each ratio and error."""
     out = []
-    ends = ("_ratio", "_error", "_told", "_applied", "refused")
+    ends = ("_ratio", "_error", "_reported", "_applied", "refused")
     names = [q for q in table["quantity"].unique() if q.endswith(ends) and q not in MAPS]
     for (world, algorithm), rows in table.groupby(["world", "algorithm"], sort=False):
         for name in names:

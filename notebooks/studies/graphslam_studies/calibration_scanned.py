@@ -151,11 +151,11 @@ def _measurements(
     scale = float(np.exp(b["distance_scale"].value - a["distance_scale"].value))
     yield Measurement(name, "distance_scale_error", scale / added.scale - 1.0)
     sigma = math.hypot(a["distance_scale"].sigma, b["distance_scale"].sigma)
-    yield Measurement(name, "distance_scale_sigma_told", sigma)
+    yield Measurement(name, "distance_scale_sigma_reported", sigma)
     yield Measurement(name, "distance_scale_applied", float(b["distance_scale"].applied))
     both = [x["yaw_bias"] for x in (a, b) if "yaw_bias" in x]
     estimated = len(both) == 2 and math.hypot(both[0].sigma, both[1].sigma) < YAW_BIAS_SIGMA
-    yield Measurement(name, "yaw_bias_told", float(estimated))
+    yield Measurement(name, "yaw_bias_reported", float(estimated))
     if estimated:
         yield Measurement(name, "yaw_bias_error", both[1].value - both[0].value - added.bias)
     rates = {"yaw_bias": 1.0, "turn_per_metre": speed}
@@ -187,10 +187,10 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
     for key, value in of_run.items():
         yield Measurement(name, key, value)
         yield Measurement(name, f"{key}_input", of_input[key])
-    yield Measurement(name, "input_told", float("input-better" in codes))
+    yield Measurement(name, "input_reported", float("input-better" in codes))
     yield Measurement(name, "calibration_refused", float("calibration-refused" in codes))
     yield Measurement(
-        name, "worse_untold", float(of_run["path"] > 1.1 * of_input["path"] and "input-better" not in codes)
+        name, "worse_unreported", float(of_run["path"] > 1.1 * of_input["path"] and "input-better" not in codes)
     )
 
 

@@ -51,7 +51,7 @@ class CalibrationTrialConfig:
     """Errors added to the motion of a recorded log; None: random in each run."""
     first: float | None = None
     """Duration of the used part of a log of scans [s]; None: all."""
-    ways: tuple[str, ...] = ()
+    motions: tuple[str, ...] = ()
     """Maps to make of a log of scans."""
     presets: str = ""
     """Preset whose map is compared; its options except for the noise are used for the other maps too."""
@@ -68,7 +68,7 @@ def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Mea
         if config.frontend == "rbpf-ekf":
             return list(_recorded(config, seed))
         return list(
-            scanned(config.source, config.presets, config.frontend, config.added, config.first, config.ways, seed)
+            scanned(config.source, config.presets, config.frontend, config.added, config.first, config.motions, seed)
         )
 
 

@@ -145,7 +145,7 @@ class GraphTrial(GridTrial):
             solver.solve_to_optimum()
         if kind != "chain":
             few = replace(c.find, rounds=0, appearance=None)
-            find = {"matches": replace(few, ties=None), "ties": few}.get(kind, c.find)
+            find = {"matches": replace(few, overlaps=None), "overlaps": few}.get(kind, c.find)
             closer = find_loops(graph, solver, submaps, find)
         return BuiltGraph(graph, solver.solution(), closer, perf_counter() - begin)
 

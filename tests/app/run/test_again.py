@@ -57,7 +57,7 @@ def go_on(log: SensorLog, out: Path, **options: Any) -> gs.Run:
 
 def remade(folder: Path) -> None:
     before = snapshot(folder, SAME_BYTES)
-    assert {"run.json", "taken.npz", "graph.g2o", "figures/map.png"} <= set(before)
+    assert {"run.json", "inputs.npz", "graph.g2o", "figures/map.png"} <= set(before)
     assert (folder / "timings.json").is_file()
     rerun_without_loops(folder, [], progress=False)
     after = snapshot(folder, SAME_BYTES)

@@ -110,7 +110,7 @@ def test_a_gap_in_the_readings_is_counted_and_bridged_by_the_submaps(every, monk
     assert r.metric("path_rmse_aligned") < bare.metric("path_rmse_aligned")
     (event,) = [e for e in r.events if e["event"] == "imu"]
     assert 0 < sum(event["dropped"].values()) < 10
-    assert 15 < event["ways"] < 24
+    assert 15 < event["preintegrated"] < 24
 
 
 def test_what_the_front_end_used_is_not_used_again(monkeypatch):
@@ -186,7 +186,7 @@ def test_wheels_and_an_imu_in_the_plane(gravity):
     r = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False, config={"imu": {"use": "auto"}})
     bare = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False)
     (event,) = [e for e in r.events if e["event"] == "imu"]
-    assert event["ways"] == len(r.graph.submaps)
+    assert event["preintegrated"] == len(r.graph.submaps)
     assert not event["dropped"]
     assert r.metric("imu_gyro_bias") == pytest.approx(2e-3, abs=4 * r.metric("imu_gyro_bias_sigma"))
     assert r.metric("imu_gyro_bias_sigma") < 1e-3

@@ -59,18 +59,16 @@ def test_they_are_decided_on_with_all_loops(drive: tuple[list[Submap], Array], s
     ledger = ledger_of_events(back.graph.events).current()
     front = {(d.submap_i, d.submap_j, d.verdict) for d in ledger if d.source == "front-end"}
     assert front == {(0, 2, "accepted"), (0, 1, "rejected")}
-    overlaps = [d for d in ledger if d.source == "tie"]
+    overlaps = [d for d in ledger if d.source == "overlap"]
     assert overlaps
     assert all(d.verdict == "accepted" for d in overlaps)
     assert {(d.submap_i, d.submap_j) for d in overlaps} == {(0, 2)}
     end = se3.se3_between(bases[0], bases[2])
     off = [np.linalg.norm(b.graph.values.poses[b.graph.submaps[2].node][:3] - end[:3]) for b in (trusting, back)]
     assert off[1] < 0.2
-    without = run(submaps, replace(CONFIG, loop_ties=False), solver)
-    assert {d.source for d in ledger_of_events(without.graph.events).current()} == {"front-end"}
 
 
-def test_a_match_is_undone_with_its_ties(
+def test_a_match_is_undone_with_its_overlap_constraints(
     drive: tuple[list[Submap], Array], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ledger = ledger_of_events(run(drive[0], CONFIG, "batch").graph.events).current()
@@ -78,7 +76,7 @@ def test_a_match_is_undone_with_its_ties(
     back = run(drive[0], CONFIG, "batch", undo=(match,))
     assert not any(r.group in ("loop", "match") for r in back.graph.records.values())
     undone = [d for d in ledger_of_events(back.graph.events).current() if d.verdict == "undone"]
-    assert {d.source for d in undone} == {"front-end", "tie"}
+    assert {d.source for d in undone} == {"front-end", "overlap"}
     assert {d.why for d in undone} == {"asked for", f"by loop {match}, which was undone"}
 
     # and comes back with them
@@ -88,6 +86,6 @@ def test_a_match_is_undone_with_its_ties(
     monkeypatch.setattr(app_loops, "rerun_without_loops", lambda folder, numbers, progress: asked.extend(numbers))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
-    overlap = next(d.loop for d in undone if d.source == "tie")
+    overlap = next(d.loop for d in undone if d.source == "overlap")
     app_loops.redo_loop(tmp_path, overlap)
     assert {d.loop for d in asked} == {d.loop for d in undone} - {overlap}

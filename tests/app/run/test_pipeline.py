@@ -24,7 +24,7 @@ FILES = {
     *("config.toml", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
     *("association.npz", "graph.g2o", "graph.npz", "nodes.tum", "trajectory.tum"),
     *("truth.npz", "truth.tum", "dead_reckoning.tum"),
-    *("submaps", "figures", "gps_all.npz", "report.html", "timings.json", "taken.npz", "inputs"),
+    *("submaps", "figures", "gps_all.npz", "report.html", "timings.json", "inputs.npz", "inputs"),
     *("generations", "current", ".lock"),
 }
 

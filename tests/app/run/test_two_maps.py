@@ -28,7 +28,7 @@ from tests.faults.kills import snapshot
 
 OPTIONS: dict[str, Any] = {
     "frontend": {"filter": {"particles": 3}},
-    "backend": {"loops": True, "loop_ties": False},
+    "backend": {"loops": True},
     "map": {"fuse": False},
     "refine": {"use": False},
 }

@@ -226,10 +226,10 @@ def test_gps_ties_what_was_never_seen_twice(tmp_path: Path) -> None:
     assert np.linalg.norm(e[3:5]) < 0.5
     assert m.metric("corridor_ties") == 0
     assert m.solution.score["gps"].factors == len(a.path) + len(b.path)
-    with pytest.raises(DataError, match=r"corridor: cannot be merged .* no tie to hall: .* looked alike"):
+    with pytest.raises(DataError, match=r"corridor: cannot be merged .* no link to hall: .* looked alike"):
         graphslam.merge(pair, by="places")
     bare = replace(pair[1], fixes=None)
-    with pytest.raises(DataError, match=r"corridor: cannot be merged .* no tie to hall"):
+    with pytest.raises(DataError, match=r"corridor: cannot be merged .* no link to hall"):
         graphslam.merge([pair[0], bare])
     with pytest.raises(DataError, match="no GPS"):
         graphslam.merge([pair[0], bare], by="gps")

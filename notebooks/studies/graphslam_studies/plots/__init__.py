@@ -7,7 +7,7 @@ _EXPORTS = {
     "evidence": "plot_sharing shared_bricks",
     "gap": "plot_convergence plot_gap_along plot_tree_gap",
     "gps": "plot_gps_vectors",
-    "knobs": "knob",
+    "setting_plots": "plot_settings",
     "local_map": "plot_correlation plot_local_map",
     "method_maps": "plot_method_maps",
     "particles": "plot_ancestry plot_exit plot_exit_panels plot_handovers plot_histories plot_lineage plot_pasts",

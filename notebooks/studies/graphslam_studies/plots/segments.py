@@ -102,7 +102,7 @@ def sample_paths(
     Returns
     -------
     paths : list of (n, dim)
-    ties : list of DrawnMatch
+    matches : list of DrawnMatch
         Of segments that entered a map which the sample holds.
     labels : list of str
         Number in time, with "m" where an older map was entered.

@@ -58,7 +58,7 @@ def plot_solid(
     view: ViewDirection | None = None,
     margin: float = 6.0,
     pixels: int = 900,
-    way: bool = True,
+    route: bool = True,
     title: str | None = None,
 ) -> Axes:
     """A world with everything above a height taken off, shaded, and the way on it, dotted where something hides it.
@@ -71,7 +71,7 @@ def plot_solid(
         What is shown beside the way [m].
     pixels : int
         Width of the picture.
-    way : bool
+    route : bool
         Draw it.
 
     Raises
@@ -92,7 +92,7 @@ def plot_solid(
     caster = RayCaster.of(world)
     image = _shaded(caster, view, u, v, below, _ends(p[:, :2].T, margin))
     ax.imshow(image, origin="lower", extent=(u[0], u[-1], v[0], v[-1]), interpolation="bilinear", zorder=0)
-    if way:
+    if route:
         on, xy = p[:, 2] < below, view.project(p)
         seen = on & _visible(caster, view, p + (0.0, 0.0, 0.2), below)
         for rows, ls, lw in ((on & ~seen, ":", 0.9), (seen, "-", 1.4)):

@@ -127,7 +127,7 @@ class CampusConfig:
     """Its correlation time [s]."""
     hidden_share: Range = (0.1, 0.5)
     """Share of the satellites behind a wall that are taken all the same, by a reflection."""
-    hidden_way: Range = (5.0, 20.0)
+    hidden_path: Range = (5.0, 20.0)
     """Mean of the longer way of such a signal [m]."""
     least_satellites: int = 5
     """No fix with fewer."""

@@ -102,7 +102,7 @@ def measure_gps(
 
     # a satellite behind a wall is taken while a slow process is in its upper tail; its way is longer, never shorter
     reflected = correlated("taken", c.reflect_time) > _upper(drawn["hidden_share"])
-    longer = drawn["hidden_way"] * 0.5 * (1.0 + correlated("way", c.reflect_time) ** 2)
+    longer = drawn["hidden_path"] * 0.5 * (1.0 + correlated("way", c.reflect_time) ** 2)
     by_wall = drawn["reflect_sigma"] * np.exp(-wall / c.reflect_reach)[:, None]
     error = drawn["orbit_sigma"] * correlated("orbit", c.orbit_time) + by_wall * correlated("wall", c.reflect_time)
     error += drawn["code_sigma"] * tree.child("code").generator().standard_normal(shape)

@@ -69,7 +69,7 @@ def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
     places = loop_places(submaps, 3.0)
     found = overlap_candidates(submaps, places)
     assert found
-    assert all(x.source == "tie" and x.facts == {"entries": []} for x in found)
+    assert all(x.source == "overlap" and x.facts == {"entries": []} for x in found)
     g = group_of(places.T_base_node)
     for x in found:
         a, b = places.T_base_node[x.i], places.T_base_node[x.j]
@@ -81,7 +81,7 @@ def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
     arcs = places.arc[[x.j for x in found]]
     assert np.diff(arcs).min() >= 6.0
     assert len(found) == 2
-    assert not overlap_candidates(submaps, places, config=OverlapConfig(least_way=100.0))
+    assert not overlap_candidates(submaps, places, config=OverlapConfig(least_path=100.0))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -133,7 +133,7 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
         solver.solve_to_optimum()
         closer = find_loops(graph, solver, drives, config)
         names = [closer.loops[n].source for n in closer.accepted]
-        overlaps = [closer.loops[n] for n in closer.accepted if closer.loops[n].source == "tie"]
+        overlaps = [closer.loops[n] for n in closer.accepted if closer.loops[n].source == "overlap"]
         if not right:
             assert all(x.submaps[0] == x.submaps[1] for x in overlaps)
         return graph, names
@@ -141,8 +141,8 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
     config = FindConfig(front_end=True, rounds=0)
     graph, sources = solved(config)
     assert sources.count("front-end") == int(right)
-    assert sources.count("tie") >= 4
-    without, _ = solved(replace(config, ties=None))
+    assert sources.count("overlap") >= 4
+    without, _ = solved(replace(config, overlaps=None))
     end = graph.submaps[-1].exit_node
     P, P0 = (g.covariance().poses()[end] for g in (graph, without))
     assert np.linalg.det(P) < 0.5 * np.linalg.det(P0)

@@ -1,4 +1,4 @@
-"""A knob: one picture at several settings; in a live notebook a slider turns through all of them."""
+"""One picture at several settings; in a live notebook a slider selects one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from graphslam.plots import style
 
 
-def knob(
+def plot_settings(
     draw: Callable[[Axes, Any], object],
     settings: Sequence[Any],
     *,
@@ -22,7 +22,7 @@ def knob(
     size: tuple[float, float] = (4.4, 4.0),
     share: bool = True,
 ) -> Figure:
-    """Draw the same picture at some settings side by side, and offer all of them to turn through.
+    """Draw the same picture at some settings side by side, and offer all of them to select from.
 
     The row of pictures needs nothing but matplotlib, so that a notebook says the same on paper, on a site, and where it
     is run without anybody looking. Where ipywidgets are installed and a notebook is open, a slider is below it.
@@ -34,7 +34,7 @@ def knob(
     settings : sequence
         All settings, in order.
     name : str
-        What is turned, with its unit.
+        Name of the setting, with its unit.
     shown : int or sequence
         How many settings are drawn beside each other, evenly spaced from first to last; or which.
     size : (float, float)
@@ -54,12 +54,12 @@ def knob(
 
     Examples
     --------
-    >>> row = knob(lambda ax, n: ax.plot(np.sin(n * np.arange(9.0))), [1, 2, 3], name="frequency", shown=2)
+    >>> row = plot_settings(lambda ax, n: ax.plot(np.sin(n * np.arange(9.0))), [1, 2, 3], name="frequency", shown=2)
     >>> [ax.get_title() for ax in row.axes]
     ['frequency: 1', 'frequency: 3']
     """
     if not len(settings):
-        raise ValueError("a knob needs settings")
+        raise ValueError("wanted at least one setting")
     if isinstance(shown, int):
         shown = [settings[k] for k in np.unique(np.linspace(0, len(settings) - 1, shown).round().astype(int))]
     row, axes = plt.subplots(
@@ -84,7 +84,7 @@ def knob(
 def slider_of(
     draw: Callable[[Axes, Any], object], settings: Sequence[Any], *, name: str, size: tuple[float, float] = (4.4, 4.0)
 ) -> Any:
-    """The slider of a knob and the picture below it; None outside a notebook, or without ipywidgets.
+    """The slider of the settings and the picture below it; None outside a notebook, or without ipywidgets.
 
     Nothing is drawn before it is moved for the first time.
     """
