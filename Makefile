@@ -17,7 +17,7 @@ WORKERS ?= 2
 export NUMBA_THREADING_LAYER ?= workqueue
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup demo test docs lint types bench clean
+.PHONY: setup demo test test-all docs lint types bench clean
 .DEFAULT_GOAL := demo
 
 setup: $(STAMP)
@@ -41,7 +41,11 @@ demo: $(BASE)
 	@echo "look at demo-run/figures/fused_level0.png and fused_level1.png"
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
+
+# Also the rest of the tables of faults, of which `make test` runs each fault with one front end.
+test-all:
+	@$(MAKE) --no-print-directory test TESTS=--all
 
 # The documentation site, build/site/index.html; a warning is an error.
 $(DOCS): $(BASE)

@@ -45,8 +45,17 @@ def cpu_seconds() -> float:
     return sum(os.times()[:4])
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order in which files are given to processes; in a file nothing changes."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--all``: also the tests marked slow."""
+    parser.addoption("--all", action="store_true", help="also the rest of the tables of which a sample is run")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Order in which files are given to processes; in a file nothing changes. Slow tests are left out, and counted."""
+    if not config.getoption("--all"):
+        left_out = [item for item in items if item.get_closest_marker("slow")]
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=left_out)
     ranks = {Path(__file__).parent / name: k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
     _cpu_before[0] = cpu_seconds()

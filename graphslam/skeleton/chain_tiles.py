@@ -43,7 +43,7 @@ POSE_SECONDS = 2e-6
 """CPU time per pose and step [s] before the first measurement: typical value with loops at one pose in a hundred."""
 FORMAT = "graphslam.chain-tiles/1"
 _INDEX = "chain.json"
-_SHAPE = {"format": str, "ties": str, "tiles": [{"file": str, "poses": str, "begin": int, "end": int}]}
+_SHAPE = {"format": str, "links": str, "tiles": [{"file": str, "poses": str, "begin": int, "end": int}]}
 _LOOPS = ("ends", "loop_rotation", "loop_translation", "loop_covariance")
 
 Index = npt.NDArray[np.int64]
@@ -101,7 +101,7 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
         tiles.append({"file": store_arrays(out, arrays), "poses": start, "begin": begin, "end": end})
         begin = end
     between = store_arrays(out, {name: np.concatenate([t[name] for t in between_tiles]) for name in between_tiles[0]})
-    write_json(out / _INDEX, {"format": FORMAT, "ties": between, "tiles": tiles})
+    write_json(out / _INDEX, {"format": FORMAT, "links": between, "tiles": tiles})
     return out
 
 
@@ -162,11 +162,11 @@ def relax_tiles(
     where = Path(folder).resolve()
     index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
     tiles = index["tiles"]
-    separator = _Separator(stored_arrays(where, index["ties"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
+    separator = _Separator(stored_arrays(where, index["links"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
     seconds = [POSE_SECONDS * (int(t["end"]) - int(t["begin"])) for t in tiles]
     spent: list[float] = []
     known: list[bool] = []
-    given = {index["ties"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
+    given = {index["links"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
 
     with task_runner(workers, cluster) as run:
 

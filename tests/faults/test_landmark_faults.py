@@ -19,6 +19,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam_studies.faults import landmarks as inject
 from tests.faults.landmark_rows import KNOWN, ROWS, Row, table
+from tests.faults.sample import one_of_each
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md"
 CERTAIN = 0.999
@@ -95,7 +96,7 @@ def judge(row: Row) -> tuple[str, list[str], Score | None]:
     return "made", [f.code for f in run.verdict if f.level in ("look", "bad")], score(run, log)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda r: r.id)
+@pytest.mark.parametrize("row", one_of_each(ROWS, lambda r: (r.sensor, r.fault)), ids=lambda r: r.id)
 def test_a_fault_has_its_outcome(row: Row) -> None:
     made, lines, found = judge(row)
     if row.outcome == "refused":

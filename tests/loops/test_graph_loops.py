@@ -103,7 +103,7 @@ def test_undo_gives_the_evidence_back() -> None:
     ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), RobustKernel("huber", 3.0))
 
 
-def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
+def test_overlap_constraints_are_a_class_of_their_own_that_tests_nothing() -> None:
     """They were made of the poses of the chain: their small residuals must not pass for a sign of small errors."""
     poses = square_poses(3, nodes=73)
     rng = np.random.default_rng(2)
@@ -123,8 +123,8 @@ def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
     out = Metrics()
     solution_metrics(out, ours.solver.solution(), 0)
     keys = {r["key"] for r in out.rows}
-    assert {"tie_chi2", "loop_chi2_per_dof"} <= keys
-    assert "tie_chi2_per_dof" not in keys
+    assert {"overlap_chi2", "loop_chi2_per_dof"} <= keys
+    assert "overlap_chi2_per_dof" not in keys
     # of the whole graph as many degrees of freedom are tested as without them
     whole = whole_chi2(RunMetrics({"graph": {"classes": [c.as_row() for c in classes.values()]}}, {}))
     assert whole is not None

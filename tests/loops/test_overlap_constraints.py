@@ -148,7 +148,7 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
     assert np.linalg.det(P) < 0.5 * np.linalg.det(P0)
 
 
-def test_impossible_ties_are_refused() -> None:
+def test_impossible_overlap_options_are_refused() -> None:
     for bad in ({"spacing": 0.0}, {"sigma": -1.0}, {"sigma_angle": float("nan")}):
-        with pytest.raises(ConfigError, match="ties"):
+        with pytest.raises(ConfigError, match="overlap constraints"):
             OverlapConfig(**bad)

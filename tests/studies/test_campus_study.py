@@ -123,7 +123,7 @@ def test_a_seam_is_held_against_the_covariance_that_is_stated() -> None:
     assert near["seam_nees"] == pytest.approx(9.0 / 6.0)
     assert near["seam_sigma"] == pytest.approx(np.sqrt(0.06))
     assert (near["seam_within_3_sigma"], far["seam_within_3_sigma"]) == (1.0, 0.0)
-    assert (near["ties"], near["ties_dropped"]) == (2.0, 1.0)
+    assert (near["links"], near["links_dropped"]) == (2.0, 1.0)
     rows = [("sessions", run, "overlap", -1, q, v) for run, d in enumerate((near, far)) for q, v in d.items()]
     table = mean_table(
         pd.DataFrame(rows, columns=["world", "run", "algorithm", "submap", "quantity", "value"]), SESSIONS

@@ -24,7 +24,7 @@ def test_shown_settings_are_those_asked_for_and_own_titles_stay() -> None:
     )
     assert [ax.get_title() for ax in row.axes] == ["n: 2\n2 squared: 4"]
     plt.close(row)
-    with pytest.raises(ValueError, match="needs settings"):
+    with pytest.raises(ValueError, match="at least one setting"):
         setting_plots.plot_settings(lambda ax, v: None, [], name="n")
 
 

@@ -112,7 +112,7 @@ def _session_table(folder: ReportFolder) -> list[Markup]:
         **{"session": "session", "verdict": "verdict", "submap_map": "submap in the map", "submap_here": "submap here"},
         **{"i": "node i", "j": "node j", "source": "source", "score": "score", "why": "why", "gates": "gates"},
     }
-    return [html_element("h3", "Loop closures between sessions"), html_table(rows, columns, class_="ties")]
+    return [html_element("h3", "Loop closures between sessions"), html_table(rows, columns, class_="links")]
 
 
 def hypotheses_section(folder: ReportFolder) -> Markup:

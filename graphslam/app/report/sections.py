@@ -47,7 +47,7 @@ def what_was_run(folder: ReportFolder) -> Markup:
         columns = {
             **{"name": "session", "source": "source", "submaps": "submaps", "hangs_on": "attached to"},
             **{"common_landmarks": "common landmarks", "rejected": "rejected", "alignment_rms": "alignment rms [m]"},
-            **{"gps": "GPS", "ties": "loop closures", "ties_dropped": "loop closures dropped"},
+            **{"gps": "GPS", "links": "loop closures", "links_dropped": "loop closures dropped"},
             "T_world_first_base": "first base (x y θ, or x y z qx qy qz qw)",
         }
         shown = {k: v for k, v in columns.items() if any(k in s for s in folder.sessions)}

@@ -195,9 +195,9 @@ def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFram
     out.add("converged", float(solution.converged), "", "higher")
     if SESSION in solution.score.classes:
         score = solution.score[SESSION]
-        out.add("ties", score.factors)
-        out.add("ties_chi2", score.chi2)
-        out.add("ties_chi2_per_residual", score.chi2 / max(score.rows, 1), "", "one")
+        out.add("links", score.factors)
+        out.add("links_chi2", score.chi2)
+        out.add("links_chi2_per_residual", score.chi2 / max(score.rows, 1), "", "one")
     for s in placed[1:]:
         g = group_of(s.T_world_base)
         at, turn = s.covariance[g.position, g.position], s.covariance[g.heading, g.heading]
@@ -249,7 +249,7 @@ def _session_row(s: PlacedSession) -> dict[str, Any]:
         "T_world_first_base": s.T_world_base.tolist(),
         "hangs_on": None if a is None else a.known.name,
         "gps": s.session.fixes is not None,
-        "ties": None if a is None else len(a.used),
-        "ties_dropped": None if a is None else a.dropped,
+        "links": None if a is None else len(a.used),
+        "links_dropped": None if a is None else a.dropped,
         "candidates": [] if a is None or a.candidates is None else a.candidates.rows(),
     }

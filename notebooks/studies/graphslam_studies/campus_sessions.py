@@ -88,5 +88,5 @@ def seam(merged: MergedSubmaps, k: int, name: str, true: Array) -> Iterator[Meas
     within = d2 <= stats.chi2.ppf(THREE_SIGMA, 6)
     yield Measurement(name, "seam_within_3_sigma", float(within))
     assert s.attached is not None
-    yield Measurement(name, "ties", float(len(s.attached.used)))
-    yield Measurement(name, "ties_dropped", float(s.attached.dropped))
+    yield Measurement(name, "links", float(len(s.attached.used)))
+    yield Measurement(name, "links_dropped", float(s.attached.dropped))

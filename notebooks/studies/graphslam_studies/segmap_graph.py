@@ -1,8 +1,8 @@
 """The study ``segmap-graph``: from the SegMap to one graph: accuracy, entropy and consistency.
 
 Worlds: two garages, the mine, the building; clutter and sensor errors are random in each run. Algorithms: ``rbpf-40``,
-``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps``, ``clearest``
-of the settled segments of SegSLAM (:mod:`graphslam_studies.segmap_trial`).
+``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``overlaps``, ``loops``, ``gps`` and
+``clearest`` of the settled segments of SegSLAM (:mod:`graphslam_studies.segmap_trial`).
 
 Quantities
 ----------

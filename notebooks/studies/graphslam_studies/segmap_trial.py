@@ -1,7 +1,7 @@
 """One run of a world, from the SegMap to one graph: the effect of each step towards a consistent map.
 
 Besides the metrics of the filters (``rbpf-N``; ``segslam-N``: the most likely map sample), graphs are built from the
-settled segments. ``chain``: exits only; ``matches``: with the matches of the front end to older maps; ``ties``: also
+settled segments. ``chain``: exits only; ``matches``: with the front end's matches to older maps; ``overlaps``: also
 with constraints along the segments; ``loops``: also with loop closures searched between submaps; ``gps``: the same with
 fixes; ``clearest``: of such graphs of the settled chain and of map samples, the one whose map has the least entropy.
 Accepted loop closures are compared with ground truth.
@@ -46,7 +46,7 @@ RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
 """Error limits of a right loop closure [m], [rad]: 3 σ of a good registration, half the width of a pillar."""
 
 
-GRAPHS = ("chain", "matches", "ties", "loops", "gps", "clearest")
+GRAPHS = ("chain", "matches", "overlaps", "loops", "gps", "clearest")
 
 
 @dataclass(frozen=True, kw_only=True)

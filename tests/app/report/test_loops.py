@@ -200,7 +200,7 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     write_npz(tmp_path / "merged.npz", {**whole, "nodes": nodes})
     row = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
     candidates = [{**row, "accepted": True, "why": "agrees"}, {**row, "accepted": False, "why": "<b>no</b>"}]
-    sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "ties": 1, "candidates": candidates}]
+    sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "links": 1, "candidates": candidates}]
     report = {"format": "graphslam.merge/1", "by": "auto", "solver": "batch", "sessions": sessions}
     (tmp_path / "merge.json").write_text(json.dumps(report))
     metrics = {"converged": 1.0, "objective": 2.0, "b_base_nees": 60.0, "b_base_nees_dof": 3.0}
