@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graphslam.core.atomic import check_file_target
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
 from graphslam.core.plugins import load_plugin
@@ -142,3 +143,35 @@ def write_simulated(log: SensorLog, folder: str | Path) -> Path:
     from graphslam.io.log_folder import write_log_folder
 
     return write_log_folder(log, folder, mesh=mesh_of(log) if "made_with" in log.meta else None)
+
+
+SAMPLE_START = 1_767_225_600.0
+"""Time of the first record of the sample log [s since 1970]: 2026-01-01."""
+
+
+def write_sample(out: str | Path) -> tuple[Path, Path]:
+    """Write the sample log, an MCAP file of ROS 2, and beside it its true path: ``NAME-truth.tum``.
+
+    A robot in a building in a park, with laser, wheels, IMU and GPS: 212 s, 248 m. Nothing is downloaded; the bytes are
+    the same each time.
+
+    Raises
+    ------
+    MissingExtraError
+        The extra ``ros`` is not installed.
+    """
+    from graphslam.core.trajectory import Trajectory
+    from graphslam.io.bag_log import log_records
+    from graphslam.io.bag_writer import MessageFactory, write_bag
+    from graphslam.io.tum import write_tum
+
+    bag = check_file_target(out)
+    truth = check_file_target(bag.with_name(f"{bag.stem}-truth.tum"))
+    factory = MessageFactory()
+    log = simulate("mixed", preset="quick", seed=1)
+    assert log.truth is not None
+    assert log.truth.trajectory is not None
+    path = log.truth.trajectory
+    write_bag(bag, log_records(log, factory, start=SAMPLE_START, origin=(0.0, 0.0)), "mcap", factory)
+    write_tum(truth, Trajectory(path.times[::5] + SAMPLE_START, path.poses[::5]))  # at the rate of the wheels
+    return bag, truth

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
@@ -98,6 +100,21 @@ def fetch_command(name: str, as_json: bool = JSON) -> None:
         be_verbose()
     folder = fetch_files(name, progress=not as_json)
     print_result({"name": name, "folder": str(folder)}, str(folder), as_json=as_json)
+
+
+@app.command("sample")
+def sample_command(
+    out: Path = typer.Option(Path("sample.mcap"), "--out", "-o", help="File for the log; the true path is beside it."),
+    as_json: bool = JSON,
+) -> None:
+    """Write a small log to try: a simulated robot with laser, wheels, IMU and GPS, as MCAP of ROS 2.
+
+    Nothing is downloaded. Then: graphslam run sample.mcap --out runs/sample
+    """
+    from graphslam.app.worlds import write_sample
+
+    bag, truth = write_sample(out)
+    print_result({"log": str(bag), "truth": str(truth)}, f"{bag}\n{truth} (true path)", as_json=as_json)
 
 
 @app.command("check")
