@@ -17,7 +17,7 @@ WORKERS ?= 2
 export NUMBA_THREADING_LAYER ?= workqueue
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup demo test test-all docs lint types bench clean
+.PHONY: setup demo test test-all docs lint types bench bench-peers clean
 .DEFAULT_GOAL := demo
 
 setup: $(STAMP)
@@ -65,6 +65,10 @@ types: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quick $(WORKERS)
+
+# Beside other programs, each installed into an environment of its own below build/peers. Hours; ROWS="isam2 evo" for some.
+bench-peers: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.bench_peers $(ROWS)
 
 clean:
 	rm -rf $(VENV) build demo-run .pytest_cache .mypy_cache .ruff_cache
