@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 Work = Callable[[Path], Callable[[], "dict[str, Any]"]]
-REPEATED = {"grid", "ate", "register"}
+REPEATED = {"grid", "octomap", "bonxai", "ate", "evo", "register", "open3d"}
 """Works that are short: the first call is ``cold``, the second ``work``."""
 
 
