@@ -9,6 +9,7 @@ from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
+from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.log_checks import check_log
 from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.io.catalog import load_recording
@@ -42,6 +43,9 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
         StreamFinding("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)
     ]
     findings += check_log(log)
+    if log.of_type(LandmarkObservations):
+        text = "not tested: the clock of the observations against that of the odometry — `graphslam calibrate` does."
+        findings.append(StreamFinding("", Finding("", "not-tested", text)))
     try:
         choice = choose_front_end(log)
         findings.append(StreamFinding("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))

@@ -28,6 +28,8 @@ from graphslam.solve.sparse import SparseProblem
 
 BELIEVED = frozenset({"submap", "dense-submap", "levelled", "imu", "declination"})
 """Classes of factors that always count as inliers; so do priors."""
+BY_CHANCE = 0.1
+"""Share of the GPS fixes that can agree by chance: any two whose distance is right determine a datum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,10 @@ class GncSolver(BatchSolver):
                     "outlier", factor_id=record.factor_id, factor=record.label(), group=record.group,
                     chi2=d2, limit=limit,
                 )  # fmt: skip
-                self.graph.remove(record.factor_id, reason=f"outlier: χ² {d2:.1f} where {limit:.1f} is the limit")
+                why = f"outlier: χ² {d2:.1f} where {limit:.1f} is the limit"
+                if d2 <= limit:
+                    why = "so few of the fixes agree with the map that it can be chance"
+                self.graph.remove(record.factor_id, reason=why)
             self._searched = self.graph.revision
         self.seconds += time.perf_counter() - t0
         self._solve(self.config)
@@ -96,7 +101,7 @@ def find_outliers(
 ) -> list[tuple[FactorRecord, float, float]]:
     """Factors with a final weight below 0.5, with their final χ² and its limit.
 
-    The graph is not changed.
+    All GPS fixes, if so few of them are left that they can agree by chance. The graph is not changed.
     """
     cfg = config or GncConfig()
     records: list[Any] = list(graph.records.values())
@@ -123,7 +128,11 @@ def find_outliers(
             break
         mu *= cfg.growth
     w[doubtful] = truncation_weights(d2[doubtful] / limit[doubtful], max(mu, 1e3))
-    return [(records[k], float(d2[k]), float(limit[k])) for k in np.flatnonzero(doubtful & (w < 0.5))]
+    out = doubtful & (w < 0.5)
+    fixes = doubtful & np.array([r.group == "gps" for r in records])
+    if (out & fixes).any() and np.count_nonzero(fixes & ~out) < max(graph.dim + 1, BY_CHANCE * np.count_nonzero(fixes)):
+        out |= fixes
+    return [(records[k], float(d2[k]), float(limit[k])) for k in np.flatnonzero(out)]
 
 
 def truncation_weights(ratio: Array, mu: float) -> Array:

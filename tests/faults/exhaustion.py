@@ -40,10 +40,25 @@ from graphslam.app import cli
 from graphslam.app.run import outputs
 from graphslam.app.sessions import merge_outputs
 from graphslam.core.atomic import is_part
-from tests.faults.kills import ROOT, Operations, State, arguments_2d, called, finished_3d, log_2d, loop_of, snapshot
+from graphslam.skeleton.chain_tiles import chain_to_disk
+from graphslam_studies.montecarlo import folder as study_folder
+from tests.faults.kills import (
+    ROOT,
+    STUDY,
+    Operations,
+    State,
+    arguments_2d,
+    called,
+    finished_3d,
+    log_2d,
+    loop_of,
+    snapshot,
+)
 from tests.pictures import save_point
+from tests.reference.chain_pieces import cut_chain
+from tests.skeleton.test_chain_graph import drawn
 
-PATIENCE = 240.0
+PATIENCE = 600.0
 """Seconds after which a case hangs."""
 MEMORY = (300, 500, 750, 1000, 2000)
 """Limits of the address space [MB]."""
@@ -97,6 +112,15 @@ FLAT = {
     "export geojson": Verb(
         _path("export", "@a", "--format", "geojson", *DATUM, "--out", "@out.geojson"), ("out.geojson",), "file"
     ),
+    "export mcap": Verb(_path("export", "@a", "--format", "mcap", "--out", "@out.mcap"), ("out.mcap",), "file"),
+    "export ros2": Verb(
+        _path("export", "@a", "--format", "ros2", "--out", "@out"), ("out/*.db3", "out/*.yaml"), "folder"
+    ),
+    "init": Verb(_path("init", "@log", "--force", "--out", "@out.toml"), ("out.toml",), "file"),
+    "relax": Verb(_path("relax", "@chain"), ("chain/chain.json",)),
+    "study": Verb(
+        _path("study", STUDY, "--trials", "2", "--quick", "--json", "--out", "@out"), study_folder.SAME_BYTES, "folder"
+    ),
     "merge": Verb(
         _path("merge", "@a", "@b", "--out", "@out"), tuple(f"out/{p}" for p in merge_outputs.SAME_BYTES), "folder"
     ),
@@ -122,13 +146,20 @@ DENSE = {
         ("out2/*.yaml", "out2/*/*.pcd"),
         "folder",
     ),
+    "export mcap": Verb(_path("export", "@out", "--format", "mcap", "--out", "@out2.mcap"), ("out2.mcap",), "file"),
     "localise": Verb(lambda work: ["localise", str(work / "out"), str(work / "out"), "--submap", "0"]),
+    "demo": Verb(
+        _path("demo", "--preset", "quick", "--json", "--out", "@out2"),
+        tuple(f"out2/{p}" for p in outputs.SAME_BYTES),
+        "folder",
+    ),
 }
 
 
 def flat(work: Path) -> None:
-    """A log and two runs of it, and in ``out`` what no command writes over without being told."""
+    """A log and two runs of it, and a chain in tiles."""
     log_2d(work)
+    chain_to_disk(work / "chain", cut_chain(drawn(99, [(2, 95), (10, 40), (60, 90)], seed=2)[0], 20))
     for name, seed in (("a", 5), ("b", 6)):
         called(arguments_2d(work, name, seed))
 
@@ -455,6 +486,7 @@ def _odd(b: Bench, verb: Verb, asked: list[str], operations: int, states: Any) -
 
 
 def _fifos(b: Bench, verb: Verb, asked: list[str], operations: int, states: Any) -> Cases:
+    b.fresh()
     used = [Path(a) for a in asked if a.startswith(str(b.work)) and Path(a).exists()]
     files = [f for u in used for f in (sorted(p for p in u.rglob("*") if p.is_file()) if u.is_dir() else [u])]
     for file in [files[k - 1] for k in _spread(len(files), 2 * b.points)]:

@@ -87,6 +87,10 @@ def _twice(z: LandmarkObservations, _: Any) -> LandmarkObservations:
     return replace(z, times=np.repeat(z.times[::2], 2)[: len(z.times)])
 
 
+def _shifted(seconds: float) -> Any:
+    return lambda z, _: replace(z, times=z.times + seconds)
+
+
 def _records(n: int, name: str) -> inject.Inject:
     def change(log: SensorLog) -> SensorLog:
         return inject.with_stream(log, name, log[name].take(slice(0, n)))
@@ -239,6 +243,8 @@ def _rows() -> list[Row]:
     ]
     for frontend in ("ekf-slam", "rbpf-slam"):
         rows += [Row("GPS", f, i, o, s, frontend, log="gps", config=used) for f, i, o, s in (GPS[0], GPS[1], GPS[3])]
+    for name, seconds in (("stamps 1 s late", 1.0), ("stamps 1 s early", -1.0)):
+        rows.append(Row("landmarks", name, inject.detections(_shifted(seconds)), "reported", "residuals"))
     rows += [
         Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT),
         Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),

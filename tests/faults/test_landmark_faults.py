@@ -12,6 +12,7 @@ import pytest
 from scipy import stats
 
 import graphslam as gs
+from graphslam.app.data_check import check_source
 from graphslam.app.run.run import Run
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import se2_between, wrap_angle
@@ -20,6 +21,7 @@ from graphslam.core.records import LandmarkObservations
 from graphslam_studies.faults import landmarks as inject
 from tests.faults.landmark_rows import KNOWN, ROWS, Row, table
 from tests.faults.sample import one_of_each
+from tests.io import small_sources as small
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md"
 CERTAIN = 0.999
@@ -60,9 +62,9 @@ class Score:
 def score(run: Run, log: SensorLog) -> Score:
     assert log.truth is not None
     path, solution = log.truth.trajectory, run.solution
-    base = path.interpolate(np.array([run.submaps[0].interval[0]]))[0]
-    ends = np.array([s.interval[1] for s in run.submaps])
-    true = path.interpolate(ends)
+    t = np.array([run.submaps[0].interval[0], *(s.interval[1] for s in run.submaps)])
+    base, *_ = inside_truth = path.interpolate(t.clip(path.times[0], path.times[-1]))  # shifted stamps reach beyond it
+    true = inside_truth[1:]
     error = se2_between(np.broadcast_to(base, true.shape), true) - solution.poses[solution.exit_nodes]
     error[:, 2] = wrap_angle(error[:, 2])
     columns = (3 * (solution.exit_nodes - 1)[:, None] + np.arange(3)).ravel()
@@ -120,6 +122,23 @@ def test_a_log_without_a_fault_is_not_blamed(frontend: str, kind: str) -> None:
     run = clean_run(frontend, kind)
     codes = {f.code for f in run.verdict if f.level == "bad"}
     assert codes == ({"particles"} if frontend == "rbpf-slam" else set())  # one filter over a whole log always is wrong
+
+
+def test_tables_whose_observations_are_late_are_corrected_and_the_verdict_says_so(tmp_path: Path) -> None:
+    """Noise of a table is estimated from it, and the offset of its clocks with it."""
+    small.tables(tmp_path, seconds=60.0)
+    file = tmp_path / "observations.csv"
+    head, *rows = file.read_text().splitlines()
+    late = [",".join([f"{float(t) + 1.0:.6f}", *rest]) for t, *rest in (row.split(",") for row in rows)]
+    file.write_text("\n".join([head, *late]) + "\n")
+    run = gs.run(tmp_path, seed=1, progress=False)
+    said = next(f.text for f in run.verdict if f.code == "calibrated")
+    assert re.search(r"odometry stamps (1\.0|0\.9)\d* ± 0\.0\d+ s too early — corrected", said)
+    times, _, _, pose = small.drive(60.0)
+    true = pose[np.searchsorted(times + 1.0, run.map.trajectory.times.clip(times[0] + 1.0, times[-1] + 1.0))]
+    off = se2_between(true[:1], true) - se2_between(run.map.trajectory.poses[:1], run.map.trajectory.poses)
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 0.15
+    assert any(n.finding.code == "not-tested" and "clock" in n.finding.text for n in check_source(tmp_path))
 
 
 def test_the_page_shows_these_rows() -> None:

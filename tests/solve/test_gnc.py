@@ -79,6 +79,22 @@ def test_without_outliers_it_is_least_squares(rng, dim):
     assert graph.objective().total == pytest.approx(before, rel=1e-9)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_fixes_that_are_nearly_all_wrong_go_as_a_whole(rng, dim):
+    """Two that agree by chance determine a frame, and one alone was an error of the solver."""
+    graph, poses, bad = spoilt(rng, dim, wild=39, wrong=2)
+    solver = GncSolver(graph)
+    solver.update()
+    solution = solver.solution()
+    named = {e["factor_id"]: e["group"] for e in graph.events if e["event"] == "outlier"}
+    assert list(named.values()).count("gps") == 40
+    assert bad <= set(named)
+    assert len(set(named) - bad) <= 2  # the last fix, and one in a thousand
+    assert graph.values.datum is None
+    assert solution.converged
+    assert np.linalg.norm(solution.poses[:, :2] - poses[:, :2], axis=1).max() < 0.8
+
+
 def test_settings_that_cannot_work_are_refused():
     with pytest.raises(ConfigError, match="cannot work"):
         GncConfig(growth=1.0)

@@ -9,7 +9,7 @@ import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
 from graphslam.app.cli.terminal import print_result, text_table, write_and_print
-from graphslam.core.atomic import atomic_open
+from graphslam.core.atomic import atomic_open, check_file_target
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError, UnknownNameError
 
 
@@ -192,6 +192,7 @@ def init_command(
 
     if out.exists() and not force:
         raise ConfigError(f"{out} is there; give another name (-o), or replace it (--force)")
+    check_file_target(out)
     text = config_file(load(source, reader=reader, **reader_options(reader_option)), source, frontend)
     with atomic_open(out, "w") as file:
         file.write(text)

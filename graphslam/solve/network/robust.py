@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.position_priors import keep_datum
+from graphslam.core.position_priors import align_to_positions, keep_datum, without_position_priors
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import network_values
@@ -162,6 +163,24 @@ def truncated_least_squares(
     name, best = min(found, key=lambda f: reached[f[0]])
     final = _trim(network, flat, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
     return replace(final, scale=best.scale, rounds=best.rounds, start=name, reached=reached)
+
+
+def with_weaker_positions(
+    network: PoseNetwork, probability: float, *, trust_odometry: bool = True, noise_scale: float | None = None
+) -> tuple[PoseNetwork, float]:
+    """The network with the information of its position priors divided by their variance over that in the file, >= 1.
+
+    It is the median of their χ² at the map that all other measurements give, which is then aligned to them.
+    """
+    rest = without_position_priors(network)
+    options: dict[str, Any] = {"trust_odometry": trust_odometry, "noise_scale": noise_scale}
+    found = truncated_least_squares(rest, network_arrays(rest), None, probability, **options).end.values
+    poses = align_to_positions(network, found.poses)
+    priors = network.position_priors
+    costs = network_arrays(network).squared(network_values(network, poses, found.landmarks.reshape(-1, 2)))
+    excess = max(float(np.median(costs[: len(priors)][priors])) / chi2_quantile(0.5, network.dim), 1.0)
+    information = np.where(priors[:, None, None], network.information / excess, network.information)
+    return replace(network, information=information), excess
 
 
 def _least_squares(network: PoseNetwork, used: Mask, *, chordal: bool) -> Values | None:

@@ -300,7 +300,12 @@ def _isam2(task: _Task) -> _Answer:
 
 def _gnc(task: _Task) -> _Answer:
     from graphslam.solve.network.consensus import odometry_edges  # scipy.stats takes a second to load
-    from graphslam.solve.network.robust import BORNE_OUT, truncated_cost, truncated_least_squares
+    from graphslam.solve.network.robust import (
+        BORNE_OUT,
+        truncated_cost,
+        truncated_least_squares,
+        with_weaker_positions,
+    )
 
     network, flat, starts, options, progress = task
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
@@ -313,34 +318,31 @@ def _gnc(task: _Task) -> _Answer:
         # no edge is trusted, so there is no other start
         asked = best_of_starts(network, starts, flat=flat, progress=progress)
         given = {asked.start: asked.best.values}
-    robust = truncated_least_squares(
-        network,
-        flat,
-        given,
-        probability,
-        trust_odometry=trust,
-        noise_scale=None if scale is None else float(scale),
-        progress=progress,
-    )
+    how: dict[str, Any] = {"trust_odometry": trust, "noise_scale": None if scale is None else float(scale)}
+    robust = truncated_least_squares(network, flat, given, probability, **how, progress=progress)
+    priors, doubt = network.position_priors, ""
+    beyond = priors & robust.inliers[: len(priors)] & (flat.squared(robust.end.values) > robust.limit)[: len(priors)]
+    if beyond.any():
+        network, excess = with_weaker_positions(network, probability, **how)
+        flat = network_arrays(network)
+        robust = truncated_least_squares(network, flat, {}, probability, **how, progress=progress)
+        doubt = (
+            f"not solved with the assumed noise: {np.count_nonzero(beyond)} of {np.count_nonzero(priors)} position "
+            f"priors contradict the other measurements; σ of all of them was multiplied by {np.sqrt(excess):.3g}, so "
+            "that half of them agree. Check their frame, stamps and σ"
+        )
     end = robust.end
     optimum = asked or _from_robust(flat, robust)
     out = np.flatnonzero(~robust.inliers)
     m = len(network.edges)
     loops = ~odometry_edges(network) & network.relative
     kept = int(np.count_nonzero(robust.inliers[:m] & loops))
-    doubt = ""
     # loops confirmed by neighbours can be fewer than those that contradict everything
     enough = 0.5 if robust.start in ("odometry", "cauchy") else BORNE_OUT
-    if kept < enough * np.count_nonzero(loops) and np.count_nonzero(loops) >= FEWEST_LOOPS:
+    if not doubt and kept < enough * np.count_nonzero(loops) and np.count_nonzero(loops) >= FEWEST_LOOPS:
         doubt = (
             f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with each other and with the odometry "
             "with its assumed noise; either most loops are wrong, or the odometry is worse than stated"
-        )
-    beyond = network.position_priors & robust.inliers[:m] & (flat.squared(end.values) > robust.limit)[:m]
-    if not doubt and beyond.any():
-        doubt = (
-            f"{np.count_nonzero(beyond)} position priors contradict the other measurements with their assumed noise, "
-            "too many to be outliers, so none of them was rejected"
         )
     details: dict[str, Any] = {
         "doubt": doubt,
