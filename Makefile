@@ -47,12 +47,17 @@ test: $(STAMP)
 test-all:
 	@$(MAKE) --no-print-directory test TESTS=--all
 
-# The documentation site, build/site/index.html; a warning is an error.
+# The documentation site, build/site/index.html; a warning is an error. The notebooks are executed first, and again after
+# a change of them or of the code; EXECUTE=0 builds the site without that: pages of notebooks show what the cache has.
 $(DOCS): $(BASE)
 	@$(PIP) --editable '.[docs]'
 	@touch $(DOCS)
 
-docs: $(DOCS)
+EXECUTE ?= 1
+docs: $(DOCS) $(if $(filter 0,$(EXECUTE)),,$(STAMP))
+ifneq ($(EXECUTE),0)
+	$(BIN)/python docs/notebook_outputs.py
+endif
 	NO_MKDOCS_2_WARNING=1 PYTHONPATH=. $(BIN)/mkdocs build --quiet --strict
 	@echo "look at build/site/index.html"
 

@@ -1,21 +1,28 @@
-"""Pages of the site that are made of other files: notebooks, public names, the command line, changes.
+"""Pages of the site that are made of other files: notebooks with outputs, gallery, public names, command line, changes.
 
-MkDocs calls these functions (`hooks` in mkdocs.yml). Nothing here is imported by the package.
+MkDocs calls these functions (`hooks` in mkdocs.yml). Nothing here is imported by the package. Outputs of notebooks come
+from the cache of `notebook_outputs.py`; a notebook that is not in it is shown without outputs, and its page says so.
 """
 
 from __future__ import annotations
 
+import base64
+import html
 import importlib
 import importlib.util
 import json
 import posixpath
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import click
 import typer
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
+
+from docs.notebook_outputs import NOTEBOOKS, cached
 
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"\[([^\[\]]*)\]\((?!https?://|#|mailto:)([^)\s#]+)(#[^)]*)?\)")
@@ -23,22 +30,25 @@ LINK = re.compile(r"\[([^\[\]]*)\]\((?!https?://|#|mailto:)([^)\s#]+)(#[^)]*)?\)
 
 def on_config(config: Any) -> Any:
     """The tutorials in the table of contents are those that there are."""
-    pages = [f"tutorials/{p.stem}.md" for p in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    pages = [f"tutorials/{p.stem}.md" for p in NOTEBOOKS]
     config.nav = [{"Tutorials": pages} if "Tutorials" in part else part for part in config.nav]
     return config
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are made."""
-    made = {
+    tutorials = [Tutorial.of(path) for path in NOTEBOOKS]
+    made: dict[str, str | bytes] = {
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
         "reference/command-line.md": command_line(),
         **reference(),
-        **{f"tutorials/{p.stem}.md": tutorial(p) for p in sorted((ROOT / "notebooks").glob("*.ipynb"))},
     }
-    for path, text in made.items():
-        files.append(File.generated(config, path, content=text))
+    for t in tutorials:
+        made[f"tutorials/{t.stem}.md"] = t.text
+        made |= {f"tutorials/{name}": picture for name, picture in t.pictures.items()}
+    for path, content in made.items():
+        files.append(File.generated(config, path, content=content))
     return files
 
 
@@ -62,19 +72,103 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return text  # a file of the repository, which the site has not
         return f"[{text}]({posixpath.relpath(site, posixpath.dirname(uri) or '.')}{part})"
 
-    return LINK.sub(there, markdown)
+    if uri == "gallery.md":
+        markdown += gallery([Tutorial.of(path) for path in NOTEBOOKS])
+    return FORMULA.sub(lambda m: typeset(m[1]), LINK.sub(there, markdown))
 
 
-def tutorial(path: Path) -> str:
-    """A notebook as a page: its text and its code; pictures come when it is run."""
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    parts = []
-    for cell in cells:
-        text = "".join(cell["source"]).strip()
-        if text:
-            parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
-    note = f"!!! note\n    Run it yourself, with its pictures: `jupyter lab notebooks/{path.name}`."
-    return "\n\n".join([parts[0], note, *parts[1:]]) + "\n"
+FORMULA = re.compile(r"^\$\$\n(.+?)\n\$\$$", re.M | re.S)
+
+
+def typeset(tex: str) -> str:
+    """A formula as MathML, which browsers draw without a script."""
+    lines = [convert(line, display="block") for line in tex.split("\n")]
+    return '<div class="formula">' + "".join(lines) + "</div>"
+
+
+USER_PARTS = ("Start", "Your log", "Tutorials", "Concepts", "Sensors")
+
+
+def on_page_context(context: Any, page: Any, config: Any, nav: Any) -> Any:
+    """A page for users ends with the next one, if its text does not name another."""
+    parts = [a.title for a in page.ancestors]
+    if page.next_page is not None and parts and parts[-1] in USER_PARTS and "<p>Next: " not in page.content:
+        to = page.next_page
+        page.content += f'\n<p>Next: <a href="{to.file.url_relative_to(page.file)}">{html.escape(to.title)}</a>.</p>'
+    return context
+
+
+@dataclass
+class Tutorial:
+    """A notebook as a page."""
+
+    stem: str
+    title: str
+    text: str
+    pictures: dict[str, bytes] = field(default_factory=dict)
+    """PNG by file name, in the order of the page."""
+
+    @classmethod
+    def of(cls, path: Path) -> Tutorial:
+        """Text, code, and the outputs if the cache has them."""
+        known = cached(path)
+        cells = json.loads((known if known.exists() else path).read_text(encoding="utf-8"))["cells"]
+        run = f"Run it yourself: `jupyter lab notebooks/{path.name}`."
+        note = "This site was built without running the notebooks (`make docs EXECUTE=0`): no outputs."
+        if known.exists():
+            note = "Outputs are those of the quick mode (`GRAPHSLAM_QUICK=1`): smaller worlds, fewer runs."
+        title = "".join(cells[0]["source"]).split("\n")[0].removeprefix("# ")
+        page = cls(stem=path.stem, title=title, text="")
+        parts = []
+        for cell in cells:
+            text = "".join(cell["source"]).strip()
+            if cell["cell_type"] == "markdown":
+                parts.append(text)
+            elif text:
+                parts.append(f'<a id="{cell["id"]}"></a>\n\n```python\n{text}\n```')
+                parts += [page.shown(output, f"{cell['id']}-{k}") for k, output in enumerate(cell["outputs"])]
+        page.text = "\n\n".join([parts[0], f"!!! note\n    {run} {note}", *parts[1:]]) + "\n"
+        return page
+
+    def shown(self, output: dict[str, Any], name: str) -> str:
+        """One output as Markdown: a picture, a table or text."""
+        if output["output_type"] == "error":
+            return f'<pre class="output">{html.escape(str(output["evalue"]))}</pre>'
+        if output["output_type"] == "stream":
+            return (
+                f'<pre class="output">{html.escape("".join(output["text"]))}</pre>'
+                if output["name"] == "stdout"
+                else ""
+            )
+        data = {kind: "".join(v) if isinstance(v, list) else v for kind, v in output.get("data", {}).items()}
+        if "image/png" in data:
+            file = f"{self.stem}-{name}.png"
+            self.pictures[file] = base64.b64decode(data["image/png"])
+            return f'<p><img alt="Output of the cell above" src="{file}"></p>'
+        if "text/html" in data:
+            table = re.sub(r"<style.*?</style>|\n\s*|border=\"1\"", "", data["text/html"], flags=re.S)
+            return f'<div class="output">{table}</div>'
+        return f'<pre class="output">{html.escape(data.get("text/plain", ""))}</pre>'
+
+
+MOST_PICTURES = 4
+"""Of a tutorial in the gallery."""
+
+
+def gallery(tutorials: list[Tutorial]) -> str:
+    """Pictures, each a link to the code that draws it."""
+    text = [""]
+    if not any(t.pictures for t in tutorials):
+        text.append(
+            "!!! note\n    This site was built without running the notebooks (`make docs EXECUTE=0`): no pictures.\n"
+        )
+    for t in (t for t in tutorials if t.pictures):
+        names = list(t.pictures)
+        some = names[:: -(-len(names) // MOST_PICTURES)]
+        cells = [re.sub(r"-\d+\.png$", "", n.removeprefix(f"{t.stem}-")) for n in some]
+        links = [f"[![{t.title}](tutorials/{n})](tutorials/{t.stem}.md#{c})" for n, c in zip(some, cells)]
+        text.append(f"## {t.title}\n\n" + "\n".join(links) + "\n{: .gallery }\n")
+    return "\n".join(text)
 
 
 def reference() -> dict[str, str]:
@@ -122,7 +216,7 @@ The public names of the packages ([architecture](../architecture.md)). The tutor
 They change more often than functions and types. Example: `from graphslam.plots import plot_scan`, or
 `gs.plots.plot_scan`.
 """
-    uses = {p.stem: p.read_text(encoding="utf-8") for p in sorted((ROOT / "notebooks").glob("*.ipynb"))}
+    uses = {p.stem: p.read_text(encoding="utf-8") for p in NOTEBOOKS}
     for room in sorted(p.parent.name for p in (ROOT / "graphslam").glob("*/__init__.py")):
         module = importlib.import_module(f"graphslam.{room}")
         face: dict[str, str] = getattr(module, "_EXPORTS", {})
