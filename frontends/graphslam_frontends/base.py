@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
@@ -15,6 +17,36 @@ from graphslam_frontends.odometry.steps import Steps
 Watch: TypeAlias = Callable[[Any], None]
 """Callback for the progress of a front end, of its own type (``segslam``:
 `graphslam_frontends.segslam.progress.SegSlamProgress`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """The current pose of the base, relative to a submap.
+
+    Parameters
+    ----------
+    time : float
+        Stamp [s].
+    anchor : int
+        Key of the submap whose base the pose is relative to; the number of submaps so far: the end of the last one.
+    pose : (7,) or (3,)
+        ``T_anchor_base``.
+    covariance : (6, 6) or (3, 3)
+        Of ``pose``, right tangent. The covariance of the anchor in the map is not included.
+    filtered : float
+        Scans until this time are used [s]; after it the motion is dead reckoning.
+    """
+
+    time: float
+    anchor: int
+    pose: Array
+    covariance: Array
+    filtered: float
+
+    @property
+    def lag(self) -> float:
+        """Time since the last scan that is used [s]."""
+        return self.time - self.filtered
 
 
 @runtime_checkable
@@ -85,6 +117,14 @@ class FrontEnd(Protocol):
     def incremental(cls) -> bool:
         """Does it output submaps while records arrive?"""
         return cls.follow is not FrontEnd.follow
+
+    def waits_for(self) -> str:
+        """The part that needs the whole log; empty if submaps are made while records arrive."""
+        return "" if self.incremental() else f"the front end {self.name} needs the whole log"
+
+    def estimate(self) -> PoseEstimate | None:
+        """The current pose, while records arrive; None: not known yet, or only at the ends of submaps."""
+        return None
 
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
         """The front end for a log whose noise was estimated.

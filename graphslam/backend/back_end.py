@@ -33,6 +33,7 @@ from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_
 from graphslam.loops.overlap_constraints import overlap_entries
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
+from graphslam_frontends.base import PoseEstimate
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
@@ -65,6 +66,9 @@ class Observer:
 
     def front_end_at(self, progress: Any) -> None:
         """A front end has made a step; the type of ``progress`` depends on the front end."""
+
+    def pose_estimated(self, estimate: PoseEstimate) -> None:
+        """Online (`gs.Slam`), after every scan: the current pose in the map, with its covariance and lag."""
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         """A submap was added to the graph, and the graph was solved."""

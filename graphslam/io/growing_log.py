@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from itertools import accumulate
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from graphslam.core.errors import DataError, MissingDataError
-from graphslam.core.log import SensorLog
+from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.record_source import RecordSource
@@ -42,23 +43,34 @@ class GrowingLog(RecordSource):
     def __init__(self, name: str, folder: str | os.PathLike[str], meta: Mapping[str, Any] | None = None) -> None:
         self._name, self._folder, self._meta = name, Path(folder), dict(meta or {})
         self._held: dict[str, _Held] = {}
+        self.drops = DropCounter()
+        """Records that were not added."""
         self._whole: SensorLog | None = None
 
     def add(self, stream: str, records: Stream) -> None:
-        """Append records, later than those of the stream so far."""
+        """Append records. Those that are not later than the stream so far (late, or given twice) are dropped, and
+        counted in `SensorLog.dropped`."""
         if self.ended:
             raise DataError("records after the end of the log", where=f"{self._name}/{stream}")
         if not len(records.times):
             return
         if stream not in self._held:
             self._held[stream] = _Held(f"{self._name}/{stream}", records, self._folder / f"{len(self._held):03d}")
-        self._held[stream].add(records)
+        held = self._held[stream]
+        late = (
+            0 if type(records) is not held.kind.cls else int(np.searchsorted(records.times, held.until, side="right"))
+        )
+        if late:
+            self.drops.drop(stream, "records that came late or twice", late)
+            records = records.take(slice(late, None))
+        if len(records.times):
+            held.add(records)
 
     def end(self) -> None:
         """End the log; no record can be added afterwards."""
         if self._whole is None:
             streams = {name: held.whole() for name, held in self._held.items()}
-            self._whole = SensorLog(name=self._name, streams=streams, meta=self._meta)
+            self._whole = SensorLog(name=self._name, streams=streams, meta=self._meta, dropped=self.drops.counts)
 
     @property
     def name(self) -> str:
@@ -131,13 +143,6 @@ class _Held:
             raise DataError(
                 "records of another kind", where=self.where, got=type(records).__name__, wanted=self.kind.cls.__name__
             )
-        if not records.times[0] > self.until:
-            raise DataError(
-                "time does not increase",
-                where=self.where,
-                got=f"{records.times[0]:.6f} after {self.until:.6f}",
-                wanted="records in the order of their stamps",
-            )
         arrays = self.kind.arrays(records)
         if set(arrays) != self.names:
             odd = ", ".join(sorted(set(arrays) ^ self.names))
@@ -160,15 +165,15 @@ class _Held:
             raise DataError("records that were already freed", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
             self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # merged once for later calls
-        a = int(np.searchsorted(self.ends, first, side="right")) - 1
-        b = max(int(np.searchsorted(self.ends, last, side="left")), a + 1)
+        a = bisect_right(self.ends, first) - 1
+        b = max(bisect_left(self.ends, last), a + 1)
         here = self.parts[a] if b == a + 1 else join_portions(self.kind, self.parts[a:b])
         return here.take(slice(first - self.ends[a], last - self.ends[a]))
 
     def discard_before(self, before: int) -> None:
         if self.spool is None:
             return
-        k = int(np.searchsorted(self.ends, before, side="right")) - 1
+        k = bisect_right(self.ends, before) - 1
         self.parts, self.ends = self.parts[k:], self.ends[k:]
 
     def whole(self) -> Stream:

@@ -80,10 +80,12 @@ def test_what_does_not_fit_is_refused_and_leaves_the_log_as_it_is(log: SensorLog
     clouds, growing = in_memory(log)[name], GrowingLog("growing", tmp_path)
     first, second = clouds.take(slice(0, 1)), clouds.take(slice(1, 2))
     growing.add(name, second)
-    with pytest.raises(DataError, match="time does not increase"):
-        growing.add(name, first)
+    growing.add(name, first)  # late, and then late, twice and new in one portion: one is added
+    growing.add(name, clouds.take(slice(0, 3)))
+    assert growing.count(name) == 2
+    assert growing.drops.counts == {f"{name}: records that came late or twice": 3}
     with pytest.raises(DataError, match="T_base_sensor"):
-        growing.add(name, replace(clouds.take(slice(2, 3)), T_base_sensor=np.array([0.5, 0, 0, 0, 0, 0, 1])))
+        growing.add(name, replace(clouds.take(slice(3, 4)), T_base_sensor=np.array([0.5, 0, 0, 0, 0, 0, 1])))
     with pytest.raises(DataError, match="another kind"):
         growing.add(name, next(s for s in log.streams.values() if not isinstance(s, PointClouds)))
     with pytest.raises(FormatError):
@@ -93,7 +95,8 @@ def test_what_does_not_fit_is_refused_and_leaves_the_log_as_it_is(log: SensorLog
     with pytest.raises(DataError, match="has not ended"):
         _ = growing.log
     growing.end()
-    assert growing.count(name) == 1
+    assert growing.count(name) == 2
+    assert growing.log.dropped == {f"{name}: records that came late or twice": 3}
     np.testing.assert_array_equal(growing.log[name].cloud(0), second.cloud(0))
     with pytest.raises(DataError, match="after the end"):
         growing.add(name, clouds.take(slice(2, 3)))

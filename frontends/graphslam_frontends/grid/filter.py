@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,7 @@ from graphslam_frontends.grid.upright import upright_beams
 from graphslam_frontends.grid.weights import evenly_spaced_indices, fill_with_mean_likelihood, maps_with_enough_scans
 
 if TYPE_CHECKING:
+    from graphslam_frontends.odometry.growing_steps import GrowingSteps
     from graphslam_frontends.odometry.steps import Steps
 
 Ints = npt.NDArray[np.int64]
@@ -155,7 +156,7 @@ class GridFilter:
 
     def __init__(
         self,
-        steps: Steps,
+        steps: Steps | GrowingSteps,
         config: GridFilterConfig,
         seed: SeedTree,
         *,
@@ -195,7 +196,7 @@ class GridFilter:
         )
         self._level(first)
         wanted = config.likelihood == "upright" and steps.tilt is not None
-        self.upright = upright_beams(steps) if wanted else None
+        self.upright = upright_beams(cast("Steps", steps)) if wanted else None
         self.ancestry = Ancestry(n, width, prune_every=prune_every)
 
     def __len__(self) -> int:
@@ -339,7 +340,7 @@ class GridFilter:
         c, returns = self.config, self.steps.scan(k)[2]
         out: list[tuple[Ints, EndpointLikelihood | CastLikelihood]] = []
         if c.likelihood != "cast":
-            first = int(self.steps.offsets[k])
+            first = 0 if self.upright is None else int(cast("Steps", self.steps).offsets[k])
             ends = returns if self.upright is None else self.upright[first : first + len(returns)]
             rows = _some(np.flatnonzero(ends), c.weight_beams)
             out.append((rows, c.by_end_points(len(rows))))

@@ -50,6 +50,8 @@ GAP_RATE = 0.3
 """σ of the yaw rate in a gap of the IMU, constant in the gap [rad/s], if the wheels do not measure it."""
 GAP_TILT = 0.1
 """σ of roll and pitch in a gap of the IMU [rad]."""
+AT_ONCE = 1024
+"""Fine steps whose transitions are computed and kept at once; more would need too much memory."""
 FLOOR_ANGLE = 1e-5
 """Least σ of the angles of an increment [rad]."""
 
@@ -336,14 +338,16 @@ def _fine_steps(knots: Array, tilt: Array, rate: Array, speed: Array) -> _Fine:
 def _transitions(fine: _Fine, at: npt.NDArray[np.intp], error_model: DeadReckoningErrorModel) -> tuple[Array, Array]:
     """Transition and noise ``(n, 12, 12)`` of the error state between the knots ``at`` ``(n,)``.
 
-    All intervals advance together, one fine step of each at a time.
+    All intervals advance together, one fine step of each at a time; a few fine steps are computed at once.
     """
     n = len(at)
     F, Q = np.tile(np.eye(STATES), (n, 1, 1)), np.zeros((n, STATES, STATES))
     counts = np.diff(at)
+    few = _fine_transition(fine, np.arange(len(fine.h)), error_model) if len(fine.h) <= AT_ONCE else None
     for m in range(int(counts.max(initial=0))):
         live = np.flatnonzero(counts > m)
-        A, N = _fine_transition(fine, at[live] + m, error_model)
+        i = at[live] + m
+        A, N = _fine_transition(fine, i, error_model) if few is None else (few[0][i], few[1][i])
         F[live + 1] = A @ F[live + 1]
         Q[live + 1] = A @ Q[live + 1] @ np.swapaxes(A, -1, -2) + N
     return F, Q

@@ -7,6 +7,7 @@ frame at the stamp. Grid front ends use nothing else.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -61,9 +62,8 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     count = DropCounter()
     names = config.scanners or scanner_names(log)
     source = motion_source(log, config, 2 if isinstance(log[names[0]], LaserScans) else 3)
-    sources = _beam_sources(log, names, source, config, count)
-    beam_times = np.concatenate([s.times for s in sources])
-    inside = (beam_times >= source.begin) & (beam_times <= source.end)
+    sources = BeamSources(log, names, source, config, count)
+    beam_times, inside = sources.times, sources.inside
     outside = len(inside) - int(inside.sum())
     if len(inside) and outside > 0.5 * len(inside):
         raise DataError(
@@ -73,37 +73,72 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
             wanted=f"{source.begin:.3f} to {source.end:.3f} s, as {', '.join(source.names)}",
         )
     count.drop(", ".join(names), "beams without odometry at their time", outside)
-    skipped = np.concatenate([s.skipped for s in sources])
+    skipped = sources.skipped
     skipped = skipped[(skipped >= source.begin) & (skipped <= source.end)]
     times, begin = _stamps(log[names[0]], np.append(beam_times[inside], skipped), source, config)
-    motion = source.solve(times, np.unique(np.append(beam_times[inside], begin)), count)
+    steps = cut_steps(log, sources, times, begin, config)
+    if config.level_floors:
+        steps = replace(steps, tilt=level_on_the_whole(steps.tilt, steps.odometry.increments))
+    for what, n in count.counts.items():
+        _log.info("%s: %s: %d", log.name, what, n)
+    if drops is not None:
+        drops.counts.update(count.counts)
+    return match_neighbours(steps, drops=drops) if config.match_scans else steps
 
+
+class BeamSources:
+    """The beams of the scanners of a log, and the motion to deskew them with.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Scanners.
+    drops : DropCounter
+        Counts omitted beams and scans.
+    """
+
+    def __init__(
+        self, log: SensorLog, names: tuple[str, ...], motion: MotionSource, config: StepConfig, drops: DropCounter
+    ) -> None:
+        self.names, self.motion, self.drops = names, motion, drops
+        self.of = _beam_sources(log, names, motion, config, drops)
+        self.times = np.concatenate([s.times for s in self.of])
+        self.inside = (self.times >= motion.begin) & (self.times <= motion.end)
+        self.skipped = np.concatenate([s.skipped for s in self.of])
+
+    def times_with_skipped(self) -> Array:
+        """Stamps of all beams and of the scans left out as repetitions [s]."""
+        return np.append(self.times, self.skipped)
+
+
+def cut_steps(log: SensorLog, sources: BeamSources, times: Array, begin: float, config: StepConfig) -> Steps:
+    """Steps that end at ``times`` ``(n,)``, the first from ``begin`` on [s], without options for the whole log."""
+    names, source, count = sources.names, sources.motion, sources.drops
+    beam_times, inside = sources.times, sources.inside
+    used = inside & (beam_times >= begin) & (beam_times <= times[-1])
+    motion = source.solve(times, np.unique(np.append(beam_times[used], begin)), count)
     step = assign_steps(beam_times, times, begin)
     step[~inside] = -1
     if config.silent == "unknown":
-        silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources]) & inside
+        silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources.of]) & inside
         step[silent] = -1
         count.drop(", ".join(names), "beams without a range", int(silent.sum()))
     chosen, offsets, thinned = _choose(step, len(times), config.most_points)
     count.drop(", ".join(names), f"beams thinned out ({config.most_points} per step kept)", thinned)
     count.drop("steps", "step without a beam (kept)", int(np.sum(np.diff(offsets) == 0)))
-    origins, ends, met = _beams(sources, chosen, config)
+    origins, ends, met = _beams(sources.of, chosen, config)
     origins, ends = deskew_beams(motion.path, motion.poses, step[chosen], beam_times[chosen], origins, ends)
-    for what, n in count.counts.items():
-        _log.info("%s: %s: %d", log.name, what, n)
-    if drops is not None:
-        drops.counts.update(count.counts)
-    steps = Steps(
+    return Steps(
         times=times,
         odometry=motion.odometry,
         offsets=offsets,
         points=ends,
         origins=origins,
         returns=met,
-        max_range=config.max_range or max(s.max_range for s in sources),
-        range_sigma=max(s.sigma for s in sources),
+        max_range=config.max_range or max(s.max_range for s in sources.of),
+        range_sigma=max(s.sigma for s in sources.of),
         ages=times[step[chosen]] - beam_times[chosen],
-        tilt=level_on_the_whole(motion.tilt, motion.odometry.increments) if config.level_floors else motion.tilt,
+        tilt=motion.tilt,
         tilt_sigma=motion.tilt_sigma,
         tilt_time=motion.tilt_time,
         uses=frozenset((*source.names, *names)),
@@ -112,7 +147,6 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         errors=motion,
         gaps=motion.gaps,
     )
-    return match_neighbours(steps, drops=drops) if config.match_scans else steps
 
 
 def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:

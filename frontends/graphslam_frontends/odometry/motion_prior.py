@@ -143,13 +143,20 @@ class MotionPrior:
         covariance : (6, 6) or (3, 3)
             Right tangent.
         """
-        n = len(self.poses)
-        if not 0 <= start <= end < n:
-            raise DataError("no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {n}")
-        C = interval_covariance(self.biases, start, end, level_start=level_start, level_end=level_end)
-        a = remove_roll_pitch(self.poses[start]) if level_start else self.poses[start]
-        b = remove_roll_pitch(self.poses[end]) if level_end else self.poses[end]
-        return group_of(a).between(a, b), C
+        return motion_between(self.poses, self.biases, start, end, level_start=level_start, level_end=level_end)
+
+
+def motion_between(
+    poses: Array, biases: BiasStates, start: int, end: int, *, level_start: bool = False, level_end: bool = False
+) -> tuple[Array, Array]:
+    """See :meth:`MotionPrior.between`."""
+    n = len(poses)
+    if not 0 <= start <= end < n:
+        raise DataError("no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {n}")
+    C = interval_covariance(biases, start, end, level_start=level_start, level_end=level_end)
+    a = remove_roll_pitch(poses[start]) if level_start else poses[start]
+    b = remove_roll_pitch(poses[end]) if level_end else poses[end]
+    return group_of(a).between(a, b), C
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

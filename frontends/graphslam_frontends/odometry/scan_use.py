@@ -8,6 +8,7 @@ stretch, propagated to the end of the path.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import Odometry
 from graphslam.core.submap import Submap
+from graphslam_frontends.odometry.growing_steps import GrowingSteps
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import check_motion, half_turn_seconds, motion_findings
 from graphslam_frontends.odometry.motion_prior import OdometryBiases, interval_covariance
@@ -63,14 +66,13 @@ def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
     )
 
 
-def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
+def unobserved_stretches(steps: Steps | GrowingSteps) -> list[tuple[int, int]]:
     """Stretches ``(first, last)`` of steps, both inclusive and at least :data:`LONG`, without scan corrections.
 
     Steps with fewer than :data:`FEW` returns, and steps in a gap of the motion.
     """
     n = len(steps)
-    met = np.concatenate([[0], np.cumsum(steps.returns)])[steps.offsets]
-    bad: npt.NDArray[np.bool_] = np.diff(met) < FEW
+    bad: npt.NDArray[np.bool_] = steps.returned < FEW
     for a, b in zip(steps.gaps.begin, steps.gaps.end):
         if b - a >= LONG:
             bad[1:] |= (steps.times[1:] > a) & (steps.times[:-1] < b)
@@ -82,7 +84,9 @@ def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
     return out
 
 
-def unobserved_covariance(steps: Steps, stretches: list[tuple[int, int]], path: Array, first: int, last: int) -> Array:
+def unobserved_covariance(
+    steps: Steps | GrowingSteps, stretches: list[tuple[int, int]], path: Array, first: int, last: int
+) -> Array:
     """Covariance ``(d, d)`` that stretches without a correction add at the end of a path, right tangent.
 
     Parameters
@@ -106,7 +110,7 @@ def unobserved_covariance(steps: Steps, stretches: list[tuple[int, int]], path: 
     return 0.5 * (total + total.T)
 
 
-def dead_reckoning_covariance(steps: Steps, start: int, end: int, *, level_end: bool = True) -> Array:
+def dead_reckoning_covariance(steps: Steps | GrowingSteps, start: int, end: int, *, level_end: bool = True) -> Array:
     """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent.
 
     From the source of the motion, with systematic errors; otherwise from the increments, as white noise.
@@ -122,7 +126,7 @@ def dead_reckoning_covariance(steps: Steps, start: int, end: int, *, level_end: 
             return steps.errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
         except DataError:  # recorded odometry has no levelled frames
             return steps.errors.between(start, end)[1]
-    return interval_covariance(OdometryBiases(odometry=steps.odometry), start, end)
+    return interval_covariance(OdometryBiases(odometry=cast(Odometry, steps.odometry)), start, end)
 
 
 def scan_findings(steps: Steps) -> list[Finding]:

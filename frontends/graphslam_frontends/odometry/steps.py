@@ -138,6 +138,11 @@ class Steps:
         return self.points[rows], self.origins[rows], self.returns[rows]
 
     @property
+    def returned(self) -> npt.NDArray[np.int64]:
+        """Number of returns in each step ``(n,)``."""
+        return np.diff(np.concatenate([[0], np.cumsum(self.returns)])[self.offsets]).astype(np.int64)
+
+    @property
     def bias_sigmas(self) -> BiasSigmas:
         """Prior σ of the systematic errors, as given with the motion, with lower bounds."""
         stated = self.errors.biases.sigmas if isinstance(self.errors, MotionPrior) else {}

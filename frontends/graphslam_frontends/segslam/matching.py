@@ -8,9 +8,8 @@ is accepted. Particles with the same map share the results; particles with anoth
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -51,6 +50,16 @@ SAME_START = 1.0
 RIVALS = 0.15
 """In the maps of other particles of the same steps only those modes are tried that in the first map were worse by at
 most this share of the points, or by ``choice.margin`` if that is larger, so that second modes are not missed."""
+
+
+def last_value(work: Generator[None, None, V]) -> V:
+    """Do all of the work; returns its result."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            value: V = end.value
+            return value
 
 
 class RecentCache(dict[K, V]):
@@ -142,7 +151,6 @@ class Matcher:
     def __init__(self, segmap: SegMap, config: SegSlamConfig, max_range: float, *, threads: int = 1) -> None:
         self.segmap, self.config, self.max_range, self.threads = segmap, config, max_range, threads
         self.winnowed = CandidateSelection()
-        self.seconds = 0.0
         # registration targets of closed maps, made at first use
         self._targets: RecentCache[int, Target | None] = RecentCache(lambda t: 0 if t is None else POINT_BYTES * len(t))
         # fine and coarse, of one map of all particles' maps of the same steps
@@ -162,13 +170,12 @@ class Matcher:
         seed : SeedTree
             Of this attempt alone.
         """
-        begin = time.perf_counter()
-        try:
-            return self._attempt(step, poses, ahead, seed)
-        finally:
-            self.seconds += time.perf_counter() - begin
+        return last_value(self.attempting(step, poses, ahead, seed))
 
-    def _attempt(self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree) -> MatchAttempt:
+    def attempting(
+        self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree
+    ) -> Generator[None, None, MatchAttempt]:
+        """:meth:`attempt` in slices of bounded work, one search or registration each; the result is the same."""
         nothing = MatchAttempt(step=step, entries=(None,) * len(poses))
         segmap, config = self.segmap, self.config
         alive = segmap.alive
@@ -181,7 +188,7 @@ class Matcher:
         asked = self._candidates(step, poses, seed)
         if not any(map(len, asked)):
             return nothing
-        results, searches, registrations = self._register(source, asked)
+        results, searches, registrations = yield from self._register(source, asked)
         proposals = [self._proposals(c, results, ahead, seed.child("localise", i)) for i, c in enumerate(asked)]
         judged = [match_posterior(p, config.choice, config.registration) for p in proposals]
         uniform = seed.child("draw").generator().random(len(poses))
@@ -238,7 +245,7 @@ class Matcher:
 
     def _register(
         self, source: Array, asked: list[SegmentCandidates]
-    ) -> tuple[dict[int, list[Registration]], int, int]:
+    ) -> Generator[None, None, tuple[dict[int, list[Registration]], int, int]]:
         """Results by map, and the numbers of searches and registrations."""
         s, gates = self.config.search, self.config.registration.gates
         # the body may be tilted: tilt relative to the prediction is checked later
@@ -269,6 +276,7 @@ class Matcher:
                     height = [] if planar else [s.height + self.config.winnowing.rise(float(length))]
                     starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(length))])
                     searches += 1
+                    yield
                 found = register_starts(cloud, target, starts, rules)
                 registrations += len(starts)
                 if first:
@@ -280,6 +288,7 @@ class Matcher:
                     ]
                     alike.append((T, radius, near))
                 results[m] = distinct_registrations(results.get(m, []) + found)
+                yield
         return results, searches, registrations
 
     def _begin(self, segment: int) -> int:

@@ -65,7 +65,7 @@ class SegSlamResult:
     seconds : mapping of str to float
         Wall time by part [s].
     step_seconds : (n,)
-        Wall time of each step, all parts together [s].
+        CPU time of each step, all parts together [s].
     used_bytes : int
         Memory of all maps at the end [bytes].
     """

@@ -11,7 +11,7 @@ The filter at step k uses the seconds after it, so it lags behind the sensors by
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from graphslam.core.random import SeedTree
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
+from graphslam_frontends.odometry.growing_steps import GrowingSteps
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import SegSlamConfig
 from graphslam_frontends.segslam.matching import MatchAttempt, Matcher
@@ -78,14 +79,12 @@ def run_segslam(
     """
     if len(steps) < 2:
         raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")
-    run = _Run(steps, filter, config, seed, prune_every)
+    run = SegSlamFilter(steps, filter, config, seed, prune_every)
     for k in Bar(range(len(steps)), name=steps.name, unit="step", shown=progress):
-        begin = time.perf_counter()
-        run.step(k)
-        run.step_seconds[k] = time.perf_counter() - begin
+        run.step(k, last=k == len(steps) - 1)
         if watch is not None:
-            watch(run.progress(k))
-    return run.result()
+            watch(run.progress(len(steps)))
+    return run.result(steps)
 
 
 def near_pose(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
@@ -93,33 +92,38 @@ def near_pose(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
     return np.asarray(np.linalg.norm((path - T)[:, : group_of(T).dim], axis=1) <= radius)
 
 
-class _Run:
-    """State of a run, step by step."""
+class SegSlamFilter:
+    """State of a run, step by step; the steps may grow (:meth:`grow`)."""
 
     def __init__(
-        self, steps: Steps, filter: GridFilterConfig, config: SegSlamConfig, seed: SeedTree, prune_every: int
+        self,
+        steps: Steps | GrowingSteps,
+        filter: GridFilterConfig,
+        config: SegSlamConfig,
+        seed: SeedTree,
+        prune_every: int,
     ) -> None:
         self.steps, self.config, self.seed = steps, config, seed
         self.filter = GridFilter(steps, filter, seed.child("filter"), prune_every=prune_every)
         n = filter.particles
         self.group = group_of(self.filter.particles.poses)
-        self.path_length = steps.path_length
-        # accumulated absolute rotation
-        tangents = self.group.log(steps.odometry.increments)
-        turns = tangents[:, [2]] if steps.dim == 2 else tangents[:, :3]
-        self.turned = np.cumsum(np.linalg.norm(turns, axis=1))
+        self.at = -1
+        """The last step; -1 before the first."""
+        self.turned: list[float] = []  # accumulated absolute rotation until each step [rad]
         self.segmap = SegMap(
-            steps.times, self.path_length, n, dim=steps.dim, gravity=steps.tilt is not None, lift=self.filter.lift
+            steps.times, steps.path_length, n, dim=steps.dim, gravity=steps.tilt is not None, lift=self.filter.lift
         )
+        self.grow()
         self.matcher = Matcher(self.segmap, config, steps.max_range, threads=filter.threads)
         self.segmenters = [self._segmenter(0) for _ in range(n)]
         self.segmap.open(0, [SegmentEntry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
         self.ids = np.zeros(n, dtype=np.int64)  # of the open segments, in order of start: tags of the ancestry
         self.begun = 1
         self.last_attempt = float(steps.times[0])
-        self.effective = np.empty(len(steps))
-        self.step_seconds = np.zeros(len(steps))
-        self.resampled = np.zeros(len(steps), dtype=np.bool_)
+        self.effective: list[float] = []
+        self.step_seconds: list[float] = []
+        self.slice_seconds: list[float] = []
+        self.resampled: list[bool] = []
         self.scores: list[ScoreLine] = []
         self.attempts: list[MatchAttempt] = []
         self.boundaries: list[Boundary] = []
@@ -129,30 +133,62 @@ class _Run:
 
     # --- one step --------------------------------------------------------------------------------------------
 
-    def step(self, k: int) -> None:
-        """Filter step k, and decide whether segments end there."""
+    def grow(self) -> None:
+        """Use the steps that were added."""
+        steps, first = self.steps, len(self.turned)
+        self.path_length = self.segmap.path_length = steps.path_length
+        self.segmap.times = steps.times
+        tangents = self.group.log(steps.odometry.increments[first:])
+        turns = np.linalg.norm(tangents[:, [2]] if steps.dim == 2 else tangents[:, :3], axis=1)
+        self.turned.extend(np.cumsum(np.append(self.turned[-1:], turns))[len(self.turned[-1:]) :].tolist())
+
+    @property
+    def boundary(self) -> bool:
+        """Did segments end in the last step?"""
+        return bool(self.boundaries) and self.boundaries[-1].step == self.at
+
+    def step(self, k: int, *, last: bool) -> None:
+        """Filter step k, and decide whether segments end there; ``last``: no step follows."""
+        for _ in self.slices(k, last=last):
+            pass
+
+    def slices(self, k: int, *, last: bool) -> Iterator[None]:
+        """:meth:`step` in slices of bounded work, so that a caller can look at its sensors in between."""
+        work, spent = self._step(k, last), 0.0
+        while True:
+            begin = time.process_time()
+            running = next(work, False) is None
+            self.slice_seconds.append(time.process_time() - begin)
+            spent += self.slice_seconds[-1]
+            if not running:
+                break
+            yield
+        self.step_seconds.append(spent)
+
+    def _step(self, k: int, last: bool) -> Iterator[None]:
         f = self.filter
         f.predict(k)
         f.weigh(k)
         f.record(self.ids)
-        self.effective[k] = f.effective
+        self.effective.append(f.effective)
         ancestors = f.resample_if_needed(k)
+        self.resampled.append(ancestors is not None)
         if ancestors is not None:
-            self.resampled[k] = True
             self.segmap.resample(ancestors)
             self.ids = self.ids[ancestors]
             self.segmenters = [self.segmenters[a].copy() for a in ancestors]
         f.update(k)
-        if k == len(self.steps) - 1:
+        self.at = k
+        if last:
             everybody = np.arange(len(f), dtype=np.int64)
             self.closed = self._close(k, everybody, "end-of-log")
         elif k:
-            self._decide(k)
+            yield from self._decide(k)
 
-    def _decide(self, k: int) -> None:
+    def _decide(self, k: int) -> Iterator[None]:
         now = float(self.steps.times[k])
         ends, why = self._ending(k, now)
-        attempt = self._match(k, now, ends)
+        attempt = yield from self._match(k, now, ends)
         matched = np.array([e is not None for e in attempt.entries]) if attempt else np.zeros(len(ends), np.bool_)
         leaving = ends | matched
         if self.config.segmentation.decide == "filter" and leaving.any():
@@ -243,7 +279,7 @@ class _Run:
                 frames.append(T)
         return any(bool(near_pose(path, at, KNOWN_RADIUS).any()) for path, at in zip(paths, frames))
 
-    def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> MatchAttempt | None:
+    def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> Generator[None, None, MatchAttempt | None]:
         """Try to enter older maps: at intervals, and whenever a segment ends."""
         c = self.config
         if not ends.any() and now - self.last_attempt < c.choice.every - 1e-6:
@@ -255,11 +291,25 @@ class _Run:
         attempt = None
         if ahead.full:
             self.last_attempt = now
-            attempt = self.matcher.attempt(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
+            attempt, begin = yield from self._timed_attempt(k, ahead, begin)
             if attempt.candidates:
                 self.attempts.append(attempt)
         self.seconds["match"] += time.perf_counter() - begin
         return attempt
+
+    def _timed_attempt(
+        self, k: int, ahead: LookAheadScan, begin: float
+    ) -> Generator[None, None, tuple[MatchAttempt, float]]:
+        """An attempt, without the time between its slices, and the time from which on the rest counts [s]."""
+        work = self.matcher.attempting(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
+        while True:
+            try:
+                next(work)
+            except StopIteration as end:
+                return end.value, begin
+            self.seconds["match"] += time.perf_counter() - begin
+            yield
+            begin = time.perf_counter()
 
     # --- boundaries ------------------------------------------------------------------------------------------
 
@@ -312,25 +362,37 @@ class _Run:
             self.config.segmentation, float(self.steps.times[k]), float(self.path_length[k]), float(self.turned[k])
         )
 
-    def progress(self, k: int) -> SegSlamProgress:
-        """Progress after step k."""
-        best = self.filter.particles.best
-        last = int(self.closed[best]) if k == len(self.steps) - 1 else int(self.segmap.previous[best])
-        return SegSlamProgress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
+    def common(self) -> int:
+        """The last closed segment from which all particles descend; -1 if there is none.
+
+        It and those before it are in the result, whatever follows, if segments end for the whole filter.
+        """
+        t = self.segmap.table
+        heads = np.unique(self.segmap.previous)
+        while len(heads) > 1 and heads[0] >= 0:
+            late = t.end[heads] == t.end[heads].max()
+            heads = np.unique(np.append(heads[~late], t.previous[heads[late]]))
+        return int(heads[0])
+
+    def progress(self, steps: int) -> SegSlamProgress:
+        """Progress after the last step, of this number of steps; 0: not known."""
+        best, k = self.filter.particles.best, self.at
+        last = int(self.closed[best]) if self.closed[best] >= 0 else int(self.segmap.previous[best])
+        return SegSlamProgress(k + 1, steps, float(self.path_length[k]), self.segmap, last)
 
     # --- result ----------------------------------------------------------------------------------------------
 
-    def result(self) -> SegSlamResult:
-        """Result of the run; all segments are closed."""
+    def result(self, steps: Steps) -> SegSlamResult:
+        """Result of the run over all ``steps``; all segments are closed."""
         f = self.filter
         return SegSlamResult(
-            steps=self.steps,
+            steps=steps,
             segmap=self.segmap,
             closed=self.closed,
             weights=f.particles.weights,
             best=f.particles.best,
-            effective=self.effective,
-            resampled=self.resampled,
+            effective=np.array(self.effective),
+            resampled=np.array(self.resampled),
             ancestry=f.ancestry,
             scores=tuple(self.scores),
             attempts=tuple(self.attempts),
@@ -338,7 +400,7 @@ class _Run:
             winnowed=self.matcher.winnowed,
             tally=f.tally,
             seconds={**f.tally.seconds, **self.seconds},
-            step_seconds=self.step_seconds,
+            step_seconds=np.array(self.step_seconds),
             used_bytes=f.pool.used_bytes,
             seed=self.seed,
         )

@@ -21,6 +21,7 @@ from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.grid.filter_error_model import FilterDrift, interpolate_covariances
+from graphslam_frontends.odometry.growing_steps import GrowingSteps
 from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance, unobserved_covariance, unobserved_stretches
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.scan_odometry_steps import ScanOdometryErrors
@@ -52,7 +53,9 @@ class _Errors(Protocol):
     ) -> tuple[Array, Array]: ...
 
 
-def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | None = None) -> Drift:
+def drift_by_path(
+    segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | GrowingSteps | None = None
+) -> Drift:
     """Drift model along the paths of the segments of a chain, for the number of particles of the filter.
 
     With ``steps`` it includes the share of the dead-reckoning errors that the filter does not correct
@@ -122,7 +125,7 @@ def submaps_of_segments(
     *,
     uses: frozenset[str] = frozenset(),
     reasons: Mapping[int, str] | None = None,
-    first_key: int = 0,
+    after: int = -1,
     with_grids: bool = True,
 ) -> list[Submap]:
     """Submaps of a chain of segments.
@@ -135,8 +138,8 @@ def submaps_of_segments(
         Streams of the log that were used.
     reasons : mapping of step to str, optional
         Reason for the end of the interval that ends there.
-    first_key : int
-        Key of the first submap; the others follow.
+    after : int
+        Only the submaps after this key, for segments that were output before; the first has key 0.
     with_grids : bool
         Include the maps, in the frames of the submaps' bases.
     """
@@ -147,9 +150,9 @@ def submaps_of_segments(
             raise DataError(
                 f"segment {b.index} does not follow segment {a.index}", got=b.interval, wanted=f"({a.interval[1]}, …)"
             )
-    keys = {s.index: first_key + k for k, s in enumerate(segments)}
+    keys = {s.index: k for k, s in enumerate(segments)}
     out, g, ended = [], segmap.group, reasons or {}
-    for s in segments:
+    for s in segments[after + 1 :]:
         matches, considered = _matches(segmap, s, segments, keys)
         considered["holds"] = _holds(segmap, s, segments, keys)
         start, end = s.interval
@@ -264,7 +267,7 @@ def _matches(
     groups: dict[int, list[tuple[int, Array]]] = {}
     lost = 0
     for i in members[t.kind[members] == MATCH].tolist():
-        found = _target(segmap, i, segments)
+        found = match_target(segmap, int(t.source[i]), t.link[i], t.entry[i], segments)
         if found is None or keys[found[0].index] >= keys[s.index]:
             lost += 1
             continue
@@ -286,7 +289,7 @@ def _matches(
             Match(
                 target=target,
                 T_target_here=T[lead],
-                covariance=_levelled(segmap, t.entry[i], cast(Array, t.covariances[i])) + scatter,
+                covariance=levelled_covariance(segmap, t.entry[i], cast(Array, t.covariances[i])) + scatter,
                 fitness=0.0 if np.isnan(fitness) else fitness,
                 support=support,
             )
@@ -302,13 +305,24 @@ def _holds(segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mappin
     return [keys[c.index] for c in segments if any(a < c.interval[1] and c.interval[0] < b for a, b in scans)]
 
 
-def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Segment, Array] | None:
-    """The segment of the chain that a match leads to, and ``T_target_here`` between the bases; None: there is none."""
+def match_target(
+    segmap: SegMap, source: int, link: Array, entry: Array, segments: Sequence[Segment]
+) -> tuple[Segment, Array] | None:
+    """The segment of the chain that a match leads to, and ``T_target_here`` between the bases; None: there is none.
+
+    Parameters
+    ----------
+    source : int
+        The segment whose map was entered.
+    link : (7,) or (3,)
+        ``T_segment_source`` between the frames.
+    entry : (7,) or (3,)
+        ``T_segment_body`` at the entry.
+    """
     g, t = segmap.group, segmap.table
-    source = int(t.source[index])
     if not t.alive[source]:
         return None
-    T_source_body = g.compose(g.inverse(t.link[index]), t.entry[index])
+    T_source_body = g.compose(g.inverse(link), entry)
     step = nearest_step(segmap, source, T_source_body)
     # the chain may have another particle's segment there: the body pose at that step relates the two
     same = [c for c in segments if c.index == source]
@@ -324,7 +338,7 @@ def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Se
     return c, g.between(segment_base(segmap, c.T_entry), segment_base(segmap, here))
 
 
-def _levelled(segmap: SegMap, entry: Array, covariance: Array) -> Array:
+def levelled_covariance(segmap: SegMap, entry: Array, covariance: Array) -> Array:
     """Covariance in the body frame → in the levelled base frame at the same place."""
     g = group_of(entry)
     A = g.adjoint(g.between(segment_base(segmap, entry), entry))

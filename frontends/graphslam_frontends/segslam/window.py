@@ -13,6 +13,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam_frontends.grid.weights import evenly_spaced_indices
+from graphslam_frontends.odometry.growing_steps import SLACK, GrowingSteps
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.segmentation import LookAheadWindow, gather_window
 
@@ -44,7 +45,7 @@ class LookAheadScan:
         return p[rows[evenly_spaced_indices(len(rows), most)]]
 
 
-def gather_look_ahead(steps: Steps, step: int, seconds: float) -> LookAheadScan:
+def gather_look_ahead(steps: Steps | GrowingSteps, step: int, seconds: float) -> LookAheadScan:
     """The look-ahead window of a step: the returns of the steps after it, up to ``seconds`` later.
 
     Parameters
@@ -52,11 +53,10 @@ def gather_look_ahead(steps: Steps, step: int, seconds: float) -> LookAheadScan:
     seconds : float
         W.
     """
-    slack = 1e-6  # rounding of the clock must not drop a step
     until = float(steps.times[step]) + seconds
-    last = int(np.searchsorted(steps.times, until + slack, side="right")) - 1
+    last = int(np.searchsorted(steps.times, until + SLACK, side="right")) - 1
     rows = range(step + 1, last + 1)
     window = gather_window(
         steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range
     )
-    return LookAheadScan(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
+    return LookAheadScan(step=step, last=last, full=bool(steps.times[-1] >= until - SLACK), window=window)

@@ -166,14 +166,18 @@ def options_command(
     frontend: str | None = typer.Argument(None, help="Front end. Default: the options that every run has."),
     as_json: bool = JSON,
 ) -> None:
-    """List the options of a run or of a front end: name, default and meaning of each."""
+    """List the options of a run or of a front end: name, default and meaning of each; and its presets."""
     from dataclasses import asdict
 
     from graphslam.app.option_table import option_rows
+    from graphslam.app.run.config import preset_names
 
     rows = option_rows(frontend)
     text = "\n".join(f"{r.option} = {r.default}\n    {r.meaning}" for r in rows)
-    print_result({"options": [asdict(r) for r in rows]}, text, as_json=as_json)
+    presets = [] if frontend is None else preset_names(frontend)
+    if presets:
+        text += f"\npresets (--preset NAME): {', '.join(presets)}"
+    print_result({"options": [asdict(r) for r in rows], "presets": presets}, text, as_json=as_json)
 
 
 def init_command(

@@ -6,9 +6,12 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+import numpy as np
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.folder import RunFolder
@@ -21,7 +24,10 @@ from graphslam.app.run.submap_slam import SubmapSlam
 from graphslam.backend.back_end import Observer
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Stream
+from graphslam.core.point_clouds import PointClouds
+from graphslam.core.poses import group_of
+from graphslam.core.range_scans import RangeScans
+from graphslam.core.records import LandmarkObservations, LaserScans, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.stream_checks import check_streams
@@ -30,6 +36,10 @@ from graphslam.io.log_kinds import kind_name
 from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.solve.batch import state_of
 from graphslam.solve.solution import make_solution
+from graphslam_frontends.base import PoseEstimate
+
+SCANS = (LaserScans, RangeScans, PointClouds, LandmarkObservations)
+"""Records after which observers get the current pose."""
 
 
 class Slam:
@@ -45,10 +55,10 @@ class Slam:
     wait, put a queue in between.
 
     Some steps need the whole log; :attr:`waits_for` names the first of them. Then records are only stored, and
-    :meth:`finish` runs over them. This applies to front ends that decide late (``segslam``, ``rbpf-grid``), compute
-    their steps from the whole log (``scan-window``), or make a single map; to an IMU, a compass or beacons in the
-    graph; and to calibration (``calibrate.given``, ``calibrate.use = "always"``). With ``"auto"`` nothing is estimated
-    from records that arrive later; the noise is that of the options.
+    :meth:`finish` runs over them. This applies to front ends that decide late (``rbpf-grid``), compute their steps from
+    the whole log (``scan-window``), or make a single map; to options of ``segslam``; to an IMU, a compass or beacons in
+    the graph; and to calibration (``calibrate.given``, ``calibrate.use = "always"``). With ``"auto"`` nothing is
+    estimated from records that arrive later; the noise is that of the options.
 
     Parameters
     ----------
@@ -102,7 +112,7 @@ class Slam:
             "frontend": frontend, "solver": solver, "seed": seed, "out": out,
             "config": {"preset": "none", **(config or {})}, "progress": list(observers) or False,
         }  # fmt: skip
-        self._stack, self._closed = ExitStack(), False
+        self._stack, self._closed, self._to = ExitStack(), False, tuple(observers)
         self._run: Run | None = None
         self._seconds = 0.0
         with self._closing_on_error():
@@ -118,6 +128,9 @@ class Slam:
     def add(self, records: Stream, stream: str | None = None) -> None:
         """Add one or more records of a sensor, and process all that is complete.
 
+        Records that are not later than those of the stream so far (late, or given twice) are dropped, and counted in
+        :attr:`dropped` and in the report of the run.
+
         Parameters
         ----------
         records : Stream
@@ -129,8 +142,7 @@ class Slam:
         Raises
         ------
         DataError
-            The records are not later than the previous ones, or of another sensor. They are not added; others may
-            follow.
+            The records are of another sensor. They are not added; others may follow.
         GraphSlamError
             The front end or the graph cannot use the records; no more records are accepted.
         """
@@ -144,7 +156,40 @@ class Slam:
             except BaseException:
                 self.close()
                 raise
+            watching = [o for o in self._to if type(o).pose_estimated is not Observer.pose_estimated]
+            here = self.estimate if watching and isinstance(records, SCANS) else None
+            if here is not None:
+                for o in watching:
+                    o.pose_estimated(here)
         self._seconds += time.perf_counter() - begin
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Numbers of records that came late or twice, by stream."""
+        return dict(self._feed.drops.counts)
+
+    @property
+    def estimate(self) -> PoseEstimate | None:
+        """The current pose; None before the first.
+
+        ``pose`` is ``T_world_base``, in the frame of the first base, with the current poses of the graph;
+        ``covariance`` is that of the motion since the submap ``anchor``. ``segslam`` answers after every scan: mean of
+        the particles, then dead reckoning over the time ``lag``. Other front ends answer with the end of the last
+        submap, at ``time``.
+        """
+        if self._slam is None or self._slam.options.front is None:
+            return None
+        graph, submaps = self._slam.back.graph, self._slam.submaps
+        found, n = self._slam.options.front.estimate(), len(submaps)
+        if found is None:
+            if not n:
+                return None
+            end, d = submaps[-1].interval[1], group_of(graph.values.poses).dof
+            return PoseEstimate(end, n, graph.values.poses[graph.submaps[-1].exit_node], np.zeros((d, d)), end)
+        if not n:
+            return found
+        at = graph.submaps[-1].exit_node if found.anchor >= n else graph.submaps[found.anchor].node
+        return replace(found, pose=group_of(found.pose).compose(graph.values.poses[at], found.pose))
 
     @property
     def submaps(self) -> Sequence[Submap]:
@@ -233,8 +278,8 @@ def _waits_for(options: RunOptions) -> str:
     """The part that needs the whole log; empty if there is none."""
     front, settings = options.front, options.settings
     assert front is not None
-    if not front.incremental():
-        return f"the front end {front.name} needs the whole log"
+    if front.waits_for():
+        return front.waits_for()
     for what, use in (("imu", settings.imu.use), ("compass", settings.compass.use), ("beacons", settings.beacons.use)):
         if use != "none":
             return f"{what}.use = {use!r} needs the whole log"

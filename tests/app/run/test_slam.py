@@ -15,15 +15,19 @@ import graphslam as gs
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.slam import Slam
 from graphslam.app.worlds import mesh_world
+from graphslam.backend.back_end import Observer
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import se2_between
 from graphslam.core.log import SensorLog
 from graphslam.core.plan_view import plan_path
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.poses import remove_roll_pitch
 from graphslam.core.records import Odometry
+from graphslam.core.se3 import se3_between
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.ring_hall import ring_hall
+from graphslam_frontends.base import PoseEstimate
 from graphslam_frontends.lidar_odometry.front_end import FIRST
 from graphslam_studies.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
 from tests.frontends.landmarks.test_preparing import in_portions
@@ -31,7 +35,14 @@ from tests.frontends.landmarks.test_preparing import in_portions
 QUIET = {"calibrate": {"use": "none"}}
 LANDMARKS: dict[str, Any] = {**QUIET, "gps": {"use": "every-second", "every": 2.0}}
 CLOUDS: dict[str, Any] = {"frontend": {"submap": {"length": 1.5, "points": 300, "reach": 15.0}}}
-BEAMS: dict[str, Any] = {**QUIET, "frontend": {"filter": {"particles": 4}, "steps": {"max_range": 8.0}}}
+BEAMS: dict[str, Any] = {
+    **QUIET,
+    "frontend": {
+        "filter": {"particles": 4},
+        "steps": {"max_range": 8.0},
+        "segslam": {"segmentation": {"min_seconds": 3.0, "min_length": 2.0, "max_length": 4.0}},
+    },
+}
 
 
 def landmarks() -> SensorLog:
@@ -80,7 +91,7 @@ def wheeled() -> SensorLog:
 def beams() -> SensorLog:
     whole = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
     begin, _ = whole.interval
-    return whole.slice(begin, begin + 15.0)
+    return whole.slice(begin, begin + 24.0)
 
 
 def same_files(folder: Path) -> dict[str, bytes]:
@@ -162,6 +173,44 @@ def test_what_was_fed_is_on_the_map_before_the_end_and_looking_at_it_changes_not
     assert looked.finish() is a
 
 
+class Poses(Observer):
+    """Keeps the pose after every scan."""
+
+    def __init__(self) -> None:
+        self.seen: list[PoseEstimate] = []
+
+    def pose_estimated(self, estimate: PoseEstimate) -> None:
+        self.seen.append(estimate)
+
+
+def test_segslam_has_a_pose_after_every_scan_with_its_covariance_and_lag() -> None:
+    log, poses, asked = beams(), Poses(), []
+    assert log.truth is not None
+    slam = gs.Slam("segslam", config=BEAMS, observers=[poses])
+    for time, name, k in log.events():
+        slam.add(log[name].take(slice(k, k + 1)), name)
+        if name == "scanner" and poses.seen:
+            asked.append(time)
+    assert slam.estimate is not None
+    assert slam.estimate.time == poses.seen[-1].time
+    assert len(poses.seen) == len(asked) > 100
+    assert len(slam.submaps) > 0
+    assert {e.anchor for e in poses.seen} >= {0, 1}
+    start = log.truth.trajectory.interpolate(np.array([beginning := poses.seen[0].filtered]))[0]
+    assert beginning < 2.0
+    first = remove_roll_pitch(start)
+    off = []
+    for time, e in zip(asked, poses.seen, strict=True):
+        assert time - 0.1 <= e.time <= time + 0.1  # at the scan, not at the last filtered step
+        assert 3.9 <= e.lag <= 8.0
+        assert np.linalg.eigvalsh(e.covariance).min() > 0
+        there = log.truth.trajectory.interpolate(np.array([e.time]))[0]
+        off.append(np.linalg.norm(se3_between(se3_between(first, there), e.pose)[:3]))
+    assert np.median(off) < 0.3
+    assert max(off) < 0.8  # 24 m of path
+    assert gs.Slam("ekf").estimate is None
+
+
 def test_beams_that_were_used_leave_the_memory() -> None:
     log = clouds()
     bytes_of_all = sum(c.nbytes for c in log["clouds"])
@@ -183,8 +232,9 @@ def test_a_record_that_cannot_be_used_is_refused_and_others_follow() -> None:
     log, slam = landmarks(), gs.Slam("ekf", config=QUIET)
     first, second = (log["controls"].take(slice(k, k + 1)) for k in (0, 1))
     slam.add(second, "controls")
-    with pytest.raises(DataError, match="time does not increase"):
-        slam.add(first, "controls")
+    slam.add(first, "controls")  # late, and once more twice: dropped and counted
+    slam.add(log["controls"].take(slice(0, 2)), "controls")
+    assert slam.dropped == {"controls: records that came late or twice": 3}
     with pytest.raises(DataError, match="another kind"):
         slam.add(log["landmarks"].take(slice(3, 4)), "controls")
     other = replace(log["controls"].take(slice(2, 3)), geometry=gs_geometry(3.3))
@@ -195,6 +245,7 @@ def test_a_record_that_cannot_be_used_is_refused_and_others_follow() -> None:
     run = slam.finish()
     assert set(run.log.streams) == {"controls", "landmark-observations"}
     assert len(run.log["controls"].times) == len(log["controls"].times) - 1
+    assert run.log.dropped["controls: records that came late or twice"] == 3
     with pytest.raises(DataError, match="after the end"):
         slam.add(second, "controls")
 

@@ -18,6 +18,7 @@ from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
+from graphslam_frontends.segslam.segslam import SegSlamFilter
 from tests.frontends.grid_world import ring
 from tests.frontends.segslam.test_segslam import CONFIG
 
@@ -107,3 +108,40 @@ def test_moment_matching_is_there_to_be_measured(log: SensorLog, submaps: list[S
     for ours, theirs in zip(submaps, papers):
         assert ours.exit_pose.tobytes() == theirs.exit_pose.tobytes()
         assert np.linalg.slogdet(theirs.exit_covariance)[1] < np.linalg.slogdet(ours.exit_covariance)[1]
+
+
+def test_a_step_in_slices_is_the_step_and_no_slice_holds_more_than_one_search(log: SensorLog) -> None:
+    """Between two records the work is one search or one registration, also when many maps are tried."""
+    steps = SegSlam(CONFIGURATION).steps(log)
+    whole, sliced = (
+        SegSlamFilter(steps, CONFIGURATION.filter, CONFIG, SeedTree(0).child(0), prune_every=32) for _ in range(2)
+    )
+    most = 0
+    for k in range(len(steps)):
+        whole.step(k, last=k == len(steps) - 1)
+        most = max(most, len(list(sliced.slices(k, last=k == len(steps) - 1))))
+    assert whole.filter.particles.poses.tobytes() == sliced.filter.particles.poses.tobytes()
+    assert [a.describe() for a in whole.attempts] == [a.describe() for a in sliced.attempts]
+    assert most >= 2
+    assert len(sliced.slice_seconds) > len(sliced.step_seconds) == len(steps)
+    searches = sum(a.searches + a.registrations for a in whole.attempts)
+    assert 0 < len(sliced.slice_seconds) - len(steps) <= 2 * searches
+
+
+def test_options_that_need_the_whole_log_are_named_and_give_the_same_interface(log: SensorLog) -> None:
+    assert SegSlam().waits_for() == ""
+    by_particle = replace(CONFIG, segmentation=replace(CONFIG.segmentation, decide="particle"))
+    waiting = SegSlam(replace(CONFIGURATION, segslam=by_particle))
+    assert "decide" in waiting.waits_for()
+    assert "level_floors" in SegSlam(SegSlamFrontEndConfig(steps=StepConfig(level_floors=True))).waits_for()
+    made = list(waiting.submaps(log, seed=SeedTree(0)))
+    assert [s.key for s in made] == list(range(len(made)))
+    assert waiting.estimate() is None
+
+
+def test_a_single_particle_gives_each_submap_as_its_segment_ends(log: SensorLog) -> None:
+    """All particles descend from it; the last submap has the findings of the whole log."""
+    alone = replace(CONFIGURATION, filter=replace(CONFIGURATION.filter, particles=1))
+    made = list(SegSlam(alone).submaps(log, seed=SeedTree(0)))
+    assert [s.key for s in made] == list(range(len(made)))
+    assert made[-1].interval[1] == log.interval[1]

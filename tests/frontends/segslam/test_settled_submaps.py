@@ -66,10 +66,8 @@ def test_a_chain_becomes_submaps_whose_exits_are_the_next_bases() -> None:
     m = loop()
     chain = common_ancestor_chain(m, 16)
     assert chain.tolist() == [0, 4, 8, 12, 16]
-    submaps = submaps_of_segments(
-        m, chain, drift, uses=frozenset({"laser"}), reasons={2: "score", 10: "end-of-log"}, first_key=3
-    )
-    assert [s.key for s in submaps] == [3, 4, 5, 6, 7]
+    submaps = submaps_of_segments(m, chain, drift, uses=frozenset({"laser"}), reasons={2: "score", 10: "end-of-log"})
+    assert [s.key for s in submaps] == [0, 1, 2, 3, 4]
     assert [s.interval for s in submaps] == [(0.0, 2.0), (2.0, 4.0), (4.0, 6.0), (6.0, 8.0), (8.0, 10.0)]
     for s in submaps[:4]:
         np.testing.assert_allclose(s.exit_pose, [4.0, 0.0, np.pi / 2], atol=1e-12)
@@ -81,7 +79,8 @@ def test_a_chain_becomes_submaps_whose_exits_are_the_next_bases() -> None:
     assert [s.report["ended"] for s in submaps] == ["score", "unknown", "unknown", "unknown", "end-of-log"]
     assert [s.report["entered"] for s in submaps] == ["new", "new", "new", "new", "match"]
     # the last went on in the map of the first: the two hold the same scans
-    assert [s.report["holds"] for s in submaps] == [[3], [4], [5], [6], [3, 7]]
+    assert [s.report["holds"] for s in submaps] == [[0], [1], [2], [3], [0, 4]]
+    assert [s.key for s in submaps_of_segments(m, chain, drift, after=2)] == [3, 4]
     json.dumps([dict(s.report) for s in submaps], allow_nan=False)
 
 

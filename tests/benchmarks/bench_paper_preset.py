@@ -1,0 +1,104 @@
+"""SegSLAM with the default settings against the equations of the paper (preset ``paper``), on the same random worlds.
+
+``python -m tests.benchmarks.bench_paper_preset [--worlds N] [--particles N] [--variants NAME ...]``: the small court,
+with other clutter, robot errors and seed in each world. Printed: means over the worlds with 95 % intervals of Student's
+t, and paired differences from the default. Path: RMS position error of a map sample after alignment. NEES: of the ends
+of all segments, a degree of freedom. CPU: of the filter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from graphslam.app.machine import one_blas_thread
+from graphslam.app.run.config import preset
+from graphslam.app.run.front_ends import make_front_end
+from graphslam.core.config import merge_options
+from graphslam.core.log import SensorLog
+from graphslam.core.poses import SE3, remove_roll_pitch
+from graphslam.core.random import SeedTree
+from graphslam.evaluate.trajectory_error import ate
+from graphslam.sim.crawler import simulate_crawler
+from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
+from graphslam_frontends.segslam.front_end import SegSlam, submaps_of_best_particle
+
+COURT = preset("court.segslam")["frontend"]
+PAPER = preset("paper.segslam")["frontend"]
+CAST = {k: PAPER["filter"][k] for k in ("likelihood", "weight_beams")}
+ALPHA = PAPER["segslam"]["segmentation"]
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": PAPER,
+    "cast": {"filter": CAST},
+    "no-walk": {"filter": {"walk_scale": 0.0}},
+    "motion-error": {"segslam": {"segmentation": {k: ALPHA[k] for k in ALPHA if "motion" in k}}},
+    "per-particle": {"segslam": {"segmentation": {"decide": "particle"}}},
+    "moments": {"segslam": {"handover": {"matched_only": True}}},
+    "localisation": {"segslam": {"choice": {"method": "localisation"}}},
+}
+
+
+def trial(log: SensorLog, seed: int, particles: int, options: dict[str, Any]) -> dict[str, float]:
+    """Figures of one filter."""
+    asked = merge_options(merge_options(COURT, {"filter": {"particles": particles}}), options)
+    front = make_front_end("segslam", asked)
+    assert isinstance(front, SegSlam)
+    assert log.truth is not None
+    begin = time.process_time()
+    result = front.result(log, seed=SeedTree(seed))
+    cpu = time.process_time() - begin
+    truth = log.truth.trajectory
+    squares, dof = 0.0, 0
+    for s in submaps_of_best_particle(result, front.config.drift, front.config.segslam):
+        a, b = remove_roll_pitch(truth.interpolate(np.array(s.interval)))
+        e = SE3.log(SE3.between(s.exit_pose, SE3.between(a, b)))
+        squares, dof = squares + float(e @ np.linalg.solve(s.exit_covariance, e)), dof + len(e)
+    report = result.report()
+    return {
+        "path [m]": float(np.sqrt(np.mean(ate(result.trajectory(), truth, max_diff=0.02).translation ** 2))),
+        "NEES/dof": squares / dof,
+        "entries": report["matches"],
+        "segments": report["intervals"],
+        "CPU [s]": cpu,
+    }
+
+
+def interval(x: np.ndarray) -> str:
+    """Mean with its 95 % interval."""
+    half = float(student.ppf(0.975, len(x) - 1) * x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else np.nan
+    return f"{x.mean():.3g} [{x.mean() - half:.3g}, {x.mean() + half:.3g}]"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worlds", type=int, default=20)
+    parser.add_argument("--particles", type=int, default=20)
+    parser.add_argument("--first", type=int, default=100, help="seed of the first world")
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
+    parser.add_argument("--quick", action="store_true", help="two worlds, four particles, two variants")
+    a = parser.parse_args()
+    if a.quick:
+        a.worlds, a.particles, a.variants = 2, 4, ["default", "paper"]
+    rows: dict[str, list[dict[str, float]]] = {v: [] for v in a.variants}
+    with one_blas_thread():
+        for seed in range(a.first, a.first + a.worlds):
+            log = simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(drift=0.02, max_range=8.0))
+            for v in a.variants:
+                rows[v].append(trial(log, seed, a.particles, VARIANTS[v]))
+                print(f"seed {seed}, {v}:", {k: round(x, 4) for k, x in rows[v][-1].items()}, flush=True)
+    for v in a.variants:
+        print(v)
+        for k in rows[v][0]:
+            x = np.array([r[k] for r in rows[v]])
+            first = np.array([r[k] for r in rows[a.variants[0]]])
+            print(f"    {k:9} {interval(x):32} difference {interval(x - first)}")
+
+
+if __name__ == "__main__":
+    main()
