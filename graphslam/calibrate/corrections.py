@@ -69,6 +69,9 @@ class Corrections:
     widen_only: bool = False
     """The noise of the motion is at least that of the log or of the front end: scan matches over a metre or two do not
     observe rare or time-correlated errors of wheels."""
+    heading_cover: float | None = None
+    """With ``widen_only``: σ of the heading that is kept from the log is at most this multiple of the estimated one;
+    None: no limit."""
     range_sigma: float | None = None
     """σ of a range [m]; None: σ of the log."""
     bearing_sigma: float | None = None
@@ -96,6 +99,8 @@ class Corrections:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise ConfigError(f"calibration: {name} = {value}; wanted ≥ 0")
+        if self.heading_cover is not None and self.heading_cover < 1:
+            raise ConfigError(f"calibration: heading_cover = {self.heading_cover}; wanted ≥ 1")
 
     @property
     def neutral(self) -> bool:
@@ -104,7 +109,8 @@ class Corrections:
 
     def without_motion_noise(self) -> Corrections:
         """Copy that does not change the noise of the motion."""
-        return replace(self, along_metre=None, widen_only=False, slips=(), **dict.fromkeys(NOISE, 0.0))
+        off = dict.fromkeys(NOISE, 0.0)
+        return replace(self, along_metre=None, widen_only=False, heading_cover=None, slips=(), **off)
 
     def without_constants(self) -> Corrections:
         """Copy without systematic errors: noise and slip only."""
@@ -260,7 +266,10 @@ def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
     )
     if c.widen_only:
         k = np.arange(g.dof)
-        P[:, k, k] = np.maximum(P[:, k, k], odometry.covariances[:, k, k])
+        stated = odometry.covariances[:, k, k]
+        if c.heading_cover is not None:
+            stated[:, heading] = np.minimum(stated[:, heading], c.heading_cover**2 * P[:, heading, heading])
+        P[:, k, k] = np.maximum(P[:, k, k], stated)
     ahead = 0 if planar else 3
     P[:, ahead, ahead] += slip_noise(odometry.times[: len(metres)], metres, c.slips)
     return replace(odometry, increments=increments, covariances=P)

@@ -160,6 +160,7 @@ class Calibration:
         if supported == "all":
             return found
         kept = self.corrections.without_constants() if supported == "noise" else Corrections()
+        kept = replace(kept, heading_cover=None)  # it covers the errors that the constants leave
         own, timed = self.corrections, prediction.timed
         kept = replace(kept, clock=own.clock if timed.clock else 0.0, slips=own.slips if timed.slips else ())
         refused = [
@@ -203,7 +204,11 @@ class Calibration:
             out.append(Finding("", "calibrated", f"systematic errors of {' and '.join(chance)}: none found."))
         if self.noise:
             text = f"noise from {self.data}: {noise_text(self.noise)}{', not used' * (supported == 'nothing')}."
-            if self.corrections.widen_only:
+            if (cover := self.corrections.heading_cover) is not None:
+                text += (
+                    f" A larger σ of distances in the log is kept; that of the heading is {cover:.2g} times this one."
+                )
+            elif self.corrections.widen_only:
                 text += " A larger σ in the log is kept."
             out.append(Finding("", "calibrated", text))
         return [*out, *self.notes]

@@ -7,14 +7,23 @@ not depend on the distance between the scans, that of the odometry grows with it
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import gammaln
 
-from graphslam.calibrate.estimate import AGREE, NAMES, SIGNIFICANT, Calibration, Estimate, Prediction
+from graphslam.calibrate.corrections import CERTAIN
+from graphslam.calibrate.estimate import (
+    AGREE,
+    NAMES,
+    SIGNIFICANT,
+    Calibration,
+    Estimate,
+    Prediction,
+    round_digits,
+)
 from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibration_of
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
@@ -39,6 +48,10 @@ FREEDOM = 4.0
 ALIKE = 0.9
 """Of two constants with a larger correlation of their errors, only one is estimated."""
 LEAST = 30
+MANY = 100
+"""Least number of matches for a smaller σ than that of the log: with fewer, slips in 3 % of them may be missed."""
+CLEAR = 2.0
+"""The σ of the log is replaced by a smaller one only if it is larger than that by more than this factor."""
 LEAST_SHARE = 0.5
 """Fraction of the neighbouring pairs that must match. Otherwise, as along a street, matches are a biased sample, and
 cross-validation cannot detect it, because the withheld half has the same bias."""
@@ -242,7 +255,7 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
     if steps.dim == 3:
         most = min(most, 60 if most <= 200 else 300)
     p = matched_pairs(steps, most)
-    estimates, notes, noise = _heading(p)
+    estimates, notes, noise, cover = _heading(p)
     scale, moved = _distance(p)
     estimates.append(scale)
     noise |= moved
@@ -253,6 +266,8 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
         text += f"{math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m — limited by scan matching."
         notes.append(Finding("", "calibrated", text))
     found = calibration_of(kind, estimates, noise, notes, data)
+    if kind == "scans" and not found.contradictions():
+        found = replace(found, corrections=replace(found.corrections, heading_cover=cover))
     return found if found.contradictions() else found.validated(cross_validate(p, found, widen=kind == "scans"))
 
 
@@ -266,7 +281,7 @@ def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Predicti
     found : Calibration
         Its applied constants are tested; each half estimates them again.
     widen : bool
-        The noise is at least that of the log.
+        The noise is at least that of the log, that of the heading up to :func:`heading_cover`.
     """
     applied = {e.name for e in found.estimates if e.applied}
     turning, along = (
@@ -290,9 +305,40 @@ def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Predicti
             for name, columns in (("all", A), ("noise", A[:, :0])):
                 r = regress_errors(e[train], columns[train], g[train])
                 v = g[test] @ r.sigmas[1:] ** 2
-                v = r.sigmas[0] ** 2 + (np.maximum(v, stated[test]) if widen else v)
+                if widen:
+                    kept = stated[test]
+                    if e is p.heading and found.corrections.heading_cover is not None:
+                        errors, grown = e[train] - columns[train] @ r.value, g[train] @ r.sigmas[1:] ** 2
+                        cover = heading_cover(errors, grown, stated[train])
+                        kept = kept if cover is None else np.minimum(kept, cover**2 * v)
+                    v = np.maximum(v, kept)
+                v = r.sigmas[0] ** 2 + v
                 gains[name] += before - student_likelihood(e[test] - columns[test] @ r.value, v)
     return Prediction(what="scan matches", count=len(p), gains=gains)
+
+
+def heading_cover(e: Array, variances: Array, stated: Array) -> float | None:
+    """Factor on the estimated σ of the heading with which it covers every error, if the log's σ is clearly larger.
+
+    Matches are taken as exact, so inaccurate ones give no small σ. The σ of distances is never replaced by a smaller
+    one: wheels that slip or run backwards change distances, and rarely.
+
+    Parameters
+    ----------
+    e : (n,)
+        Errors of the odometry [rad].
+    variances, stated : (n,)
+        Estimated ones, and those of the log [rad²].
+
+    Returns
+    -------
+    float or None
+        ≥ 1; None: the σ of the log is not clearly larger.
+    """
+    sigmas = np.sqrt(np.maximum(variances, 1e-12))
+    cover = max(1.0, float(np.max(np.abs(e) / sigmas)) / CERTAIN)
+    clear = float(np.median(np.sqrt(stated) / sigmas)) > CLEAR * cover
+    return round_digits(cover) if clear else None
 
 
 def student_likelihood(e: Array, variances: Array) -> float:
@@ -311,7 +357,7 @@ def _match_noise(e: Array, stated: Array) -> float:
     return math.exp(found.x)
 
 
-def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]:
+def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, float], float | None]:
     columns = {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn}
     names, notes = list(HEADING), list[Finding]()
     grows = np.column_stack([p.metres, p.turned, p.seconds])
@@ -348,7 +394,11 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
             gain = regress_errors(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
         out.append(_gated(name, full, parts, k, gain))
     s = full.sigmas
-    return out, notes, {"heading_metre": float(s[1]), "heading_radian": float(s[2]), "heading_second": float(s[3])}
+    removed = np.array([e.applied for e in out]) * full.value
+    errors = p.heading - np.column_stack([columns[n] for n in names]) @ removed
+    cover = heading_cover(errors, grows @ s[1:] ** 2, p.stated_heading) if len(p) >= MANY else None
+    noise = {"heading_metre": float(s[1]), "heading_radian": float(s[2]), "heading_second": float(s[3])}
+    return out, notes, noise, cover
 
 
 def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: float) -> Estimate:
