@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from graphslam.app import cli
 from graphslam.app.cli.terminal import write_and_print
-from graphslam.core.errors import FormatError
+from graphslam.core.errors import FormatError, OutputError
 
 
 def too_deep() -> None:
@@ -192,6 +193,21 @@ def test_a_program_that_cannot_be_loaded_is_one_line() -> None:
         "graphslam: cannot be loaded: not enough memory, or a damaged installation. "
         "failed to map segment from shared object\n"
     )
+
+
+def test_a_limit_of_memory_below_the_imports_is_one_line() -> None:
+    """At 500 MB the import of OpenBLAS never ended."""
+    done = run_code(
+        "import resource\nresource.setrlimit(resource.RLIMIT_AS, (500 * 10**6,) * 2)\n"
+        "from graphslam.__main__ import start\nstart()"
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == ("graphslam: not enough memory: the limit is 500 MB (ulimit -v); wanted 700 MB or more\n")
+
+
+def test_the_target_of_init_is_checked_before_its_log_is_read(tmp_path: Path) -> None:
+    done = CliRunner().invoke(cli.app, ["init", "no-such-log", "--out", str(tmp_path / "missing" / "a.toml")])
+    assert isinstance(done.exception, OutputError)
 
 
 def test_a_result_is_printed_where_its_file_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
