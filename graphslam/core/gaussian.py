@@ -35,17 +35,18 @@ def check_covariance(
         raise CovarianceError(
             f"{what} is not finite", where=where, got=f"{P[i, j]} at ({i}, {j})", wanted="finite numbers"
         )
-    scale = np.sqrt(np.abs(np.diag(P)))
-    bound = 1e-6 * np.outer(scale, scale)
-    if np.any(np.abs(P - P.T) > bound):
-        i, j = np.argwhere(np.abs(P - P.T) > bound)[0]
-        raise CovarianceError(
-            f"{what} is not symmetric",
-            where=where,
-            got=f"{P[i, j]} and {P[j, i]} at ({i}, {j})",
-            wanted="a symmetric matrix",
-        )
-    P = 0.5 * (P + P.T)
+    if not np.array_equal(P, P.T):
+        scale = np.sqrt(np.abs(np.diag(P)))
+        bound = 1e-6 * np.outer(scale, scale)
+        if np.any(np.abs(P - P.T) > bound):
+            i, j = np.argwhere(np.abs(P - P.T) > bound)[0]
+            raise CovarianceError(
+                f"{what} is not symmetric",
+                where=where,
+                got=f"{P[i, j]} and {P[j, i]} at ({i}, {j})",
+                wanted="a symmetric matrix",
+            )
+        P = 0.5 * (P + P.T)
     try:
         np.linalg.cholesky(P)
     except np.linalg.LinAlgError:

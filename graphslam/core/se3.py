@@ -5,6 +5,8 @@ A pose is ``(..., 7)``: x, y, z, qx, qy, qz, qw. Tangents are rotation first, th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from graphslam.core.errors import GeometryError
@@ -26,6 +28,12 @@ def skew(v: ArrayLike) -> Array:
 def quat_normalize(q: ArrayLike) -> Array:
     """Unit quaternions ``(..., 4)`` (xyzw) with w ≥ 0."""
     a = np.asarray(q, dtype=np.float64)
+    if a.size == 4:  # one: NumPy's calls would cost twenty times as much; the bits are the same
+        x, y, z, w = a.ravel().tolist()
+        length = math.sqrt(x * x + y * y + z * z + w * w)
+        if 1e-12 <= length < math.inf:
+            sign = -1.0 if w / length < 0 else 1.0
+            return np.array([sign * (c / length) for c in (x, y, z, w)]).reshape(a.shape)
     n = np.linalg.norm(a, axis=-1, keepdims=True)
     if not np.all(np.isfinite(n)) or np.any(n < 1e-12):
         raise GeometryError(
@@ -49,6 +57,12 @@ def _cross(a: Array, b: Array) -> Array:
 def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Hamilton product of quaternions ``(..., 4)`` in xyzw order."""
     a, b = np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
+    if a.size == 4 and a.shape == b.shape:
+        (ax, ay, az, s), (bx, by, bz, t) = a.ravel().tolist(), b.ravel().tolist()
+        x = s * bx + t * ax + (ay * bz - az * by)
+        y = s * by + t * ay + (az * bx - ax * bz)
+        z = s * bz + t * az + (ax * by - ay * bx)
+        return np.array([x, y, z, s * t - (ax * bx + ay * by + az * bz)]).reshape(a.shape)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     v = aw * bv + bw * av + _cross(av, bv)
     w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
@@ -58,6 +72,11 @@ def quat_multiply(p: ArrayLike, q: ArrayLike) -> Array:
 def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Rotate vectors ``(..., 3)`` by unit quaternions ``(..., 4)``."""
     a, u = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    if a.size == 4 and u.shape == (*a.shape[:-1], 3):
+        (x, y, z, w), (vx, vy, vz) = a.ravel().tolist(), u.ravel().tolist()
+        tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
+        turned = vx + w * tx + (y * tz - z * ty), vy + w * ty + (z * tx - x * tz), vz + w * tz + (x * ty - y * tx)
+        return np.array(turned).reshape(u.shape)
     t = 2.0 * _cross(a[..., :3], u)
     return np.asarray(u + a[..., 3:] * t + _cross(a[..., :3], t))
 
@@ -77,6 +96,8 @@ def quat_to_matrix(q: ArrayLike) -> Array:
 def matrix_to_quat(R: ArrayLike) -> Array:
     """Unit quaternions ``(..., 4)`` of rotation matrices ``(..., 3, 3)``; the largest component is computed first."""
     m = np.asarray(R, dtype=np.float64)
+    if m.size == 9:
+        return _one_matrix_to_quat(m.ravel().tolist()).reshape(*m.shape[:-2], 4)
     d = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
     tr = d.sum(-1)
     # four equivalent formulas; each is accurate if its leading component is large
@@ -94,6 +115,21 @@ def matrix_to_quat(R: ArrayLike) -> Array:
     lead = np.concatenate([1 + 2 * d - tr[..., None], (1 + tr)[..., None]], -1).argmax(-1)
     best = np.take_along_axis(q, lead[..., None, None], axis=-2)[..., 0, :]
     return quat_normalize(best)
+
+
+def _one_matrix_to_quat(m: list[float]) -> Array:
+    """:func:`matrix_to_quat` of one matrix, row by row, with the same bits."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = m
+    tr = xx + yy + zz
+    lead = [1 + 2 * xx - tr, 1 + 2 * yy - tr, 1 + 2 * zz - tr, 1 + tr]
+    best = max(range(4), key=lead.__getitem__)
+    rows = (
+        (lead[0], xy + yx, xz + zx, zy - yz),
+        (yx + xy, lead[1], yz + zy, xz - zx),
+        (zx + xz, zy + yz, lead[2], yx - xy),
+        (zy - yz, xz - zx, yx - xy, lead[3]),
+    )
+    return quat_normalize(rows[best])
 
 
 def so3_exp(omega: ArrayLike) -> Array:
