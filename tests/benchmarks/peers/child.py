@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ REPEATED = {"grid", "octomap", "bonxai", "ate", "evo", "register", "open3d"}
 
 def cpu() -> float:
     """CPU time of this process and its children [s]."""
-    return sum(os.times()[:4])
+    return time.process_time() + sum(os.times()[2:4])
 
 
 def peak() -> float:
