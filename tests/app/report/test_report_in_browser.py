@@ -62,7 +62,9 @@ def test_nothing_is_cut_off(page: str, tmp_path: Path, width: int) -> None:
           if (b.width > 0 && (b.right > w + 1 || b.left < -1)) out.push(x.tagName + "." + x.className);
         }
         const wide = [...document.querySelectorAll(".wide")];
+        const place = (x) => document.querySelector(x).getBoundingClientRect();
         return { w, all: document.documentElement.scrollWidth, out,
+          beside: place("nav").right <= place("main").left,
           scrolls: wide.filter((x) => x.scrollWidth > x.clientWidth + 1).length,
           kept: wide.every((x) => getComputedStyle(x).overflowX === "auto"),
           ms: performance.timing.domContentLoadedEventEnd - performance.timing.navigationStart };
@@ -72,6 +74,7 @@ def test_nothing_is_cut_off(page: str, tmp_path: Path, width: int) -> None:
     assert found["w"] == width
     assert found["all"] <= width
     assert found["out"] == []
+    assert found["beside"] == (width > 1000)  # the contents are a column
     assert found["kept"]
     assert width > 1000 or found["scrolls"] > 0
     assert found["ms"] < 2000

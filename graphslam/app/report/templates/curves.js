@@ -5,6 +5,9 @@
   const floats = (text) => new Float32Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   const PALE = "#D9D9D9", GREY = "#6B6B6B", VERMILION = "#D55E00", FONT = "12px system-ui, sans-serif";
   const short = (v) => (v === 0 ? "0" : Math.abs(v) >= 1e5 || Math.abs(v) < 1e-3 ? v.toExponential(2) : String(Number(v.toPrecision(4))));
+  // at most so many tick labels, so that they do not overlap
+  const thin = (all, most) => all.filter((v, k) => k % Math.max(1, Math.ceil(all.length / most)) === 0);
+  const power = (v) => (v < 1e-3 || v >= 1e5 ? v.toExponential(0) : short(v));
   let along = "t";  // t [s] since the path begins, or s [m] travelled
   const make = (tag, text) => { const x = document.createElement(tag); if (text) x.textContent = text; return x; };
 
@@ -95,7 +98,8 @@
     ctx.strokeStyle = GREY; ctx.lineWidth = 1;
     ctx.strokeRect(box.left, box.top, box.right - box.left, box.bottom - box.top);
     ctx.fillStyle = "#1a1a1a"; ctx.textAlign = "right"; ctx.textBaseline = "middle";
-    for (const v of p.log ? decades(low, high) : steps(low, high, 5)) ctx.fillText(short(v), box.left - 6, y(v));
+    const ticks = p.log ? thin(decades(low, high), (box.bottom - box.top) / 16) : steps(low, high, 5);
+    for (const v of ticks) ctx.fillText(p.log ? power(v) : short(v), box.left - 6, y(v));
     ctx.textAlign = "center"; ctx.textBaseline = "top";
     for (const v of steps(begin, end, w > 450 ? 10 : 5)) ctx.fillText(short(v), u(v), box.bottom + 4);
     ctx.fillText(along === "t" ? "time since the path begins [s]" : "travelled [m]", 0.5 * (box.left + box.right), h - 14);
@@ -114,7 +118,7 @@
       ctx.fillText(r.name + "  " + short(r.value), left, mid - 7);
     });
     ctx.textAlign = "center"; ctx.textBaseline = "top"; ctx.fillStyle = "#1a1a1a";
-    for (const v of decades(low, high)) ctx.fillText(short(v), Math.min(Math.max(u(v), 14), w - 14), h - 18);
+    for (const v of thin(decades(low, high), (right - left) / 44)) ctx.fillText(power(v), Math.min(Math.max(u(v), 16), w - 16), h - 18);
   }
   function* pieces(p) {
     let i = 0;
