@@ -16,10 +16,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
+from typing import TypeVar
 
 import graphslam
 from graphslam.core.errors import ConfigError
@@ -28,6 +29,7 @@ from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.join.registry import Material, compile_method, join_by_method
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 _TIMEOUT_S = 3600.0
 _GRAPH = "graph.npz"
@@ -108,20 +110,29 @@ def _read(folder: Path) -> Material:
     return JoinProblem.load(folder / _GRAPH)
 
 
+def peak_growth(work: Callable[[], T]) -> tuple[T, float | None]:
+    """Result of ``work()``, and the peak growth of the resident memory of this process meanwhile [MB].
+
+    None if the system does not tell. Free memory is returned to the system first: otherwise the work would reuse it,
+    which the mark does not count.
+    """
+    gc.collect()
+    trim_heap()
+    try:
+        before = _status("VmRSS")
+        Path("/proc/self/clear_refs").write_text("5")
+    except (OSError, ValueError):
+        return work(), None
+    result = work()
+    return result, max(_status("VmHWM") - before, 0) / 1e6
+
+
 def _measure_here(submaps: Material, method: str, polish: bool) -> float:
     """Compile, free memory, reset the high-water mark, join, read the mark [MB]."""
     compile_method(submaps, method, polish=polish)  # also loads modules and thread pools
-    gc.collect()
-    trim_heap()  # otherwise the join would reuse freed memory, which the mark does not count
-    before = _status("VmRSS")
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return math.nan
-    result = join_by_method(submaps, method, polish=polish)
-    peak = _status("VmHWM")
+    result, grown = peak_growth(lambda: join_by_method(submaps, method, polish=polish))
     assert result.states > 0
-    return max(peak - before, 0) / 1e6
+    return math.nan if grown is None else grown
 
 
 def _answer(end: Connection, submaps: Material, method: str, polish: bool) -> None:

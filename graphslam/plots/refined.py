@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from graphslam.core.geometry import Array
 from graphslam.core.poses import position_covariances
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
@@ -49,6 +53,27 @@ def plot_before_after(
     ax.set_ylabel("distance from ground truth [m]" if truth is not None else "distance [m]")
     ax.set_title("path before and after refinement", fontsize="medium")
     style.legend(ax)
+    return ax
+
+
+def plot_scans_along(points: Mapping[str, Array], paths: Mapping[str, Trajectory], *, title: str) -> Axes:
+    """Scan points from above along several paths, one panel each; in 3-D coloured by height. Returns the last axes.
+
+    Parameters
+    ----------
+    points : mapping of label to (q, 2) or (q, 3)
+        In the frame of the path of the same label [m].
+    """
+    figure, panels = plt.subplots(1, len(points), figsize=(5.0 * len(points), 5.0), sharex=True, sharey=True)
+    for ax, (name, x) in zip(np.atleast_1d(panels), points.items()):
+        height = x[:, 2] if x.shape[1] == 3 else np.zeros(len(x))
+        low, high = np.quantile(height, (0.02, 0.98))
+        ax.scatter(*x[:, :2].T, c=height, vmin=low, vmax=high, cmap="viridis", s=0.3, lw=0, rasterized=True)
+        ax.plot(*paths[name].positions[:, :2].T, color=style.VERMILION, lw=0.8)
+        style.metric_axes(ax)
+        ax.set_title(name, fontsize="medium")
+    figure.suptitle(title, fontsize="medium")
+    figure.tight_layout()
     return ax
 
 

@@ -75,10 +75,7 @@ def _sum_interval(detections, poses, interval, slot, ids, sums):
         h00, h01, h11 = h0 * h0, h0 * h1, h1 * h1
         R = _nine(poses.rotation, i)
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             j = detections.landmark[m]
             e = slot[j]
             if e == 0:
@@ -88,8 +85,8 @@ def _sum_interval(detections, poses, interval, slot, ids, sums):
                 slot[j] = n
                 e = n
             row = sums[e - 1]
-            bx, by = be * sx, be * sy
-            xx, xy, xz, yy, yz, zz = al + bx * sx, bx * sy, bx * sz, al + by * sy, by * sz, al + be * sz * sz
+            bx, by = be * nx, be * ny
+            xx, xy, xz, yy, yz, zz = al + bx * nx, bx * ny, bx * nz, al + by * ny, by * nz, al + be * nz * nz
             row[0] += h0 * xx
             row[1] += h0 * xy
             row[2] += h0 * xz

@@ -59,20 +59,13 @@ def split_labels(detections, poses, wrong, rules, landmark, n):
             j = landmark[m]
             if not wrong[j]:
                 continue
-            sx, sy, sz, al, be = _seen(
-                R,
-                np.float64(detections.points[m, 0]),
-                np.float64(detections.points[m, 1]),
-                np.float64(detections.points[m, 2]),
-                detections.along,
-                detections.across,
-            )
+            sx, sy, sz, nx, ny, nz, al, be = _seen(R, detections, m)
             best, least = -1, 2.0 * gate
             at = head[j]
             while at >= 0:
                 if i - last[at] <= gap and last[at] < i:  # a pose observes an object once
                     ex, ey, ez = place[at, 0] - px - sx, place[at, 1] - py - sy, place[at, 2] - pz - sz
-                    d = sx * ex + sy * ey + sz * ez
+                    d = nx * ex + ny * ey + nz * ez
                     misfit = al * (ex * ex + ey * ey + ez * ez) + be * d * d
                     if misfit < least:
                         best, least = at, misfit

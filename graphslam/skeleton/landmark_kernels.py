@@ -4,7 +4,10 @@ The residual of a measurement z (in the body frame) of landmark l from pose (R, 
 perturbed in the world frame about their position, ``R ← Exp(w) R``, ``p ← p + u``, so with the lever ``q = l - p`` the
 residual changes by ``q × w - u + dl``. The lever is always the predicted one: with the measured ``s = R z`` a rotation
 of the whole map would change the objective, and Gauss-Newton would converge linearly. ``s`` is used only in the weight
-``W = α I + β s sᵀ``, α = 1/(σ_bearing |z|)², α + β |z|² = 1/σ_range². Vectors of poses are ``(N, 6)``: w, then u.
+``W = α I + β n nᵀ`` with n = s, α = 1/(σ_bearing |z|)², α + β |z|² = 1/σ_range². Points of surfaces have a normal in
+the body frame instead: n is that normal in the world, α = 0 and β = 1/σ_along². Such a landmark is anywhere on its
+surface; it is put at the mean of its points there, by α = 1/σ_across² in the sums for its position only. Vectors of
+poses are ``(N, 6)``: w, then u.
 
 Every kernel works on the poses ``begin … end - 1``; sums over landmarks are added to arrays of the caller. Plain arrays
 only.
@@ -32,11 +35,13 @@ class Detections(NamedTuple):
     first: npt.NDArray[np.int64]
     """(N + 1,): first measurement of each pose."""
     along: float
-    """1 / σ_range² [1/m²]."""
+    """1 / σ_range² [1/m²]; with normals along the normal."""
     across: float
-    """1 / σ_bearing² [1/rad²]."""
+    """1 / σ_bearing² [1/rad²]; with normals of the position on the surface [1/m²]."""
     base: int
     """Number of measurements before the first row of ``points``; not zero if only a tile is in memory."""
+    normals: npt.NDArray[np.float32]
+    """(M, 3) unit vectors in the body frame, or none: the rays."""
 
 
 class Poses(NamedTuple):
@@ -49,18 +54,22 @@ class Poses(NamedTuple):
 
 
 @njit(nogil=True, inline="always", error_model="numpy")
-def _seen(R, x, y, z, along, across):
-    """``s = R z`` and the two parameters of its weight: W = α I + β s sᵀ."""
+def _turned(R, v, m):
+    """``R v_m``."""
+    x, y, z = np.float64(v[m, 0]), np.float64(v[m, 1]), np.float64(v[m, 2])
+    return R[0] * x + R[1] * y + R[2] * z, R[3] * x + R[4] * y + R[5] * z, R[6] * x + R[7] * y + R[8] * z
+
+
+@njit(nogil=True, inline="always", error_model="numpy")
+def _seen(R, detections, m):
+    """``s = R z``, and direction and parameters of its weight: W = α I + β n nᵀ."""
+    x, y, z = _turned(R, detections.points, m)
+    if len(detections.normals):
+        nx, ny, nz = _turned(R, detections.normals, m)
+        return x, y, z, nx, ny, nz, 0.0, detections.along
     r2 = x * x + y * y + z * z
-    alpha = across / r2
-    beta = (along - alpha) / r2
-    return (
-        R[0] * x + R[1] * y + R[2] * z,
-        R[3] * x + R[4] * y + R[5] * z,
-        R[6] * x + R[7] * y + R[8] * z,
-        alpha,
-        beta,
-    )
+    alpha = detections.across / r2
+    return x, y, z, x, y, z, alpha, (detections.along - alpha) / r2
 
 
 @njit(nogil=True, inline="always")
@@ -78,26 +87,25 @@ def count_observations(landmark, out):
 @njit(nogil=True, error_model="numpy")
 def sum_landmarks(detections, poses, begin, end, D, b):
     """Add ``Σ W`` (xx, xy, xz, yy, yz, zz) to ``D (L, 6)`` and ``Σ W (p + s)`` to ``b (L, 3)``."""
+    there = detections.across if len(detections.normals) else 0.0
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            sx, sy, sz, nx, ny, nz, al, be = _seen(R, detections, m)
             j = detections.landmark[m]
-            D[j, 0] += al + be * sx * sx
-            D[j, 1] += be * sx * sy
-            D[j, 2] += be * sx * sz
-            D[j, 3] += al + be * sy * sy
-            D[j, 4] += be * sy * sz
-            D[j, 5] += al + be * sz * sz
+            al += there
+            D[j, 0] += al + be * nx * nx
+            D[j, 1] += be * nx * ny
+            D[j, 2] += be * nx * nz
+            D[j, 3] += al + be * ny * ny
+            D[j, 4] += be * ny * nz
+            D[j, 5] += al + be * nz * nz
             ax, ay, az = px + sx, py + sy, pz + sz
-            d = be * (sx * ax + sy * ay + sz * az)
-            b[j, 0] += al * ax + d * sx
-            b[j, 1] += al * ay + d * sy
-            b[j, 2] += al * az + d * sz
+            d = be * (nx * ax + ny * ay + nz * az)
+            b[j, 0] += al * ax + d * nx
+            b[j, 1] += al * ay + d * ny
+            b[j, 2] += al * az + d * nz
 
 
 @njit(nogil=True, error_model="numpy")
@@ -124,15 +132,12 @@ def pose_gradients(detections, poses, l, begin, end, g, objective):
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         J = wx = wy = wz = ux = uy = uz = 0.0
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            sx, sy, sz, nx, ny, nz, al, be = _seen(R, detections, m)
             j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ex, ey, ez = qx - sx, qy - sy, qz - sz
-            d = be * (sx * ex + sy * ey + sz * ez)
-            fx, fy, fz = al * ex + d * sx, al * ey + d * sy, al * ez + d * sz
+            d = be * (nx * ex + ny * ey + nz * ez)
+            fx, fy, fz = al * ex + d * nx, al * ey + d * ny, al * ez + d * nz
             J += ex * fx + ey * fy + ez * fz
             ux -= fx
             uy -= fy
@@ -151,13 +156,10 @@ def landmark_chi2_kernel(detections, poses, l, begin, end, out, count):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            sx, sy, sz, nx, ny, nz, al, be = _seen(R, detections, m)
             j = detections.landmark[m]
             ex, ey, ez = l[j, 0] - px - sx, l[j, 1] - py - sy, l[j, 2] - pz - sz
-            d = sx * ex + sy * ey + sz * ez
+            d = nx * ex + ny * ey + nz * ez
             out[j] += al * (ex * ex + ey * ey + ez * ez) + be * d * d
             count[j] += 1
 
@@ -179,23 +181,20 @@ def schur_diagonal(detections, poses, landmarks, begin, end, blocks):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             j = detections.landmark[m]
-            # C = W - W D⁻¹ W, with W a = α a + β s (s·a); t = D⁻¹ s
+            # C = W - W D⁻¹ W, with W a = α a + β n (n·a); t = D⁻¹ n
             a, c, d, e, f, g = Di[j, 0], Di[j, 1], Di[j, 2], Di[j, 3], Di[j, 4], Di[j, 5]
-            tx, ty, tz = a * sx + c * sy + d * sz, c * sx + e * sy + f * sz, d * sx + f * sy + g * sz
-            k = be - be * be * (sx * tx + sy * ty + sz * tz)
+            tx, ty, tz = a * nx + c * ny + d * nz, c * nx + e * ny + f * nz, d * nx + f * ny + g * nz
+            k = be - be * be * (nx * tx + ny * ty + nz * tz)
             h = al * be
             al2 = al * al
-            xx = al + k * sx * sx - 2.0 * h * sx * tx - al2 * a
-            xy = k * sx * sy - h * (sx * ty + sy * tx) - al2 * c
-            xz = k * sx * sz - h * (sx * tz + sz * tx) - al2 * d
-            yy = al + k * sy * sy - 2.0 * h * sy * ty - al2 * e
-            yz = k * sy * sz - h * (sy * tz + sz * ty) - al2 * f
-            zz = al + k * sz * sz - 2.0 * h * sz * tz - al2 * g
+            xx = al + k * nx * nx - 2.0 * h * nx * tx - al2 * a
+            xy = k * nx * ny - h * (nx * ty + ny * tx) - al2 * c
+            xz = k * nx * nz - h * (nx * tz + nz * tx) - al2 * d
+            yy = al + k * ny * ny - 2.0 * h * ny * ty - al2 * e
+            yz = k * ny * nz - h * (ny * tz + nz * ty) - al2 * f
+            zz = al + k * nz * nz - 2.0 * h * nz * tz - al2 * g
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             C[0, 0], C[0, 1], C[0, 2] = xx, xy, xz
             C[1, 0], C[1, 1], C[1, 2] = xy, yy, yz
@@ -223,19 +222,16 @@ def gather_landmarks(detections, poses, l, v, begin, end, t):
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ax = qy * wz - qz * wy - ux
             ay = qz * wx - qx * wz - uy
             az = qx * wy - qy * wx - uz
-            d = be * (sx * ax + sy * ay + sz * az)
-            t[j, 0] += al * ax + d * sx
-            t[j, 1] += al * ay + d * sy
-            t[j, 2] += al * az + d * sz
+            d = be * (nx * ax + ny * ay + nz * az)
+            t[j, 0] += al * ax + d * nx
+            t[j, 1] += al * ay + d * ny
+            t[j, 2] += al * az + d * nz
 
 
 @njit(nogil=True)
@@ -263,17 +259,14 @@ def scatter_to_poses(detections, poses, landmarks, v, begin, end, out):
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         yx = yy = yz = zx = zy = zz = 0.0
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
-            sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
-            )
+            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ax = qy * wz - qz * wy - ux - t[j, 0]
             ay = qz * wx - qx * wz - uy - t[j, 1]
             az = qx * wy - qy * wx - uz - t[j, 2]
-            d = be * (sx * ax + sy * ay + sz * az)
-            fx, fy, fz = al * ax + d * sx, al * ay + d * sy, al * az + d * sz
+            d = be * (nx * ax + ny * ay + nz * az)
+            fx, fy, fz = al * ax + d * nx, al * ay + d * ny, al * az + d * nz
             zx -= fx
             zy -= fy
             zz -= fz

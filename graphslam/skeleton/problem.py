@@ -35,7 +35,8 @@ class SkeletonProblem:
     odometry_covariance : (6, 6) or (N - 1, 6, 6)
         Rotation vector [rad], then translation [m].
     range_sigma, bearing_sigma : float
-        Noise of the points along [m] and across [rad] the ray.
+        Noise of the points along [m] and across [rad] the ray. With ``normals``: along the normal, and the extent of a
+        landmark on its surface [m].
     start_rotation, start_position, start_covariance : (3, 3), (3,), (6, 6)
         Prior on the first pose: rotation in the world frame, then position.
     up : (N, 3), optional
@@ -48,6 +49,8 @@ class SkeletonProblem:
     tiles : Tiles, optional
         Measurements on disk; ``points`` and ``landmark`` are empty then
         (:func:`~graphslam.skeleton.tiles.write_tiled_problem`).
+    normals : (M, 3) float32, optional
+        Unit normals of the surfaces at the points, body frame. A point then measures the distance along its normal.
 
     Raises
     ------
@@ -82,10 +85,12 @@ class SkeletonProblem:
     gps_position: Array = field(default_factory=lambda: np.empty((0, 3)))
     gps_covariance: Array = field(default_factory=lambda: np.eye(3))
     tiles: Tiles | None = None
+    normals: npt.NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        for name, kind in (("points", np.float32), ("landmark", np.int32), ("first", np.int64)):
+        kinds = (("points", np.float32), ("normals", np.float32), ("landmark", np.int32), ("first", np.int64))
+        for name, kind in kinds:
             put(self, name, np.ascontiguousarray(getattr(self, name), dtype=kind))
         N = len(self.first) - 1
         if N < 2:
@@ -100,6 +105,7 @@ class SkeletonProblem:
             "start_position": (3,),
             "start_covariance": (6, 6),
             "gps_position": (len(gps), 3),
+            "normals": self.points.shape if len(self.normals) else (0, 3),
         }
         if self.up is not None:
             shapes["up"] = (N, 3)
@@ -107,7 +113,7 @@ class SkeletonProblem:
             value = getattr(self, name)
             if value is None or np.shape(value) != shape:
                 raise DataError(f"{name} of a skeleton network", got=np.shape(value), wanted=shape)
-            if name != "points":
+            if name not in ("points", "normals"):
                 put(self, name, np.ascontiguousarray(value, dtype=np.float64))
             if not np.isfinite(getattr(self, name)).all():
                 raise DataError(f"{name} of a skeleton network is not finite")
@@ -130,6 +136,8 @@ class SkeletonProblem:
             raise DataError("up_sigma", got=np.shape(self.up_sigma), wanted=(N,))
         if len(gps) and (gps.min() < 0 or gps.max() >= N):
             raise DataError("gps_pose of a pose that is not there", got=int(gps.max()), wanted=f"0 … {N - 1}")
+        if len(self.normals) and np.abs(np.linalg.norm(self.normals, axis=1) - 1.0).max() > 1e-3:
+            raise DataError("normals of a skeleton network", wanted="unit vectors")
         if self.tiles is not None:
             object.__setattr__(self, "_landmarks", self.tiles.landmarks)
             return
@@ -190,9 +198,9 @@ class SkeletonProblem:
         """At least the measurements of the poses ``begin … end - 1``, as input of the kernels."""
         along, across = self.range_sigma**-2, self.bearing_sigma**-2
         if self.tiles is None:
-            return Detections(self.points, self.landmark, self.first, along, across, 0)
+            return Detections(self.points, self.landmark, self.first, along, across, 0, self.normals)
         points, landmark = self.tiles.read(begin, end)
-        return Detections(points, landmark, self.first, along, across, int(self.first[begin]))
+        return Detections(points, landmark, self.first, along, across, int(self.first[begin]), self.normals)
 
     def chunks(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
         """Ranges of poses to process at once: all if in memory, tile by tile if on disk."""
@@ -228,7 +236,8 @@ class SkeletonProblem:
         tilts = 0
         if self.up is not None:
             tilts = int(np.isfinite(np.broadcast_to(np.asarray(self.up_sigma, np.float64), self.poses)).sum())
-        return 3 * self.measurements + 6 * self.poses + 2 * tilts + 3 * self.fixes - 6 * self.poses - 3 * self.landmarks
+        each = 1 if len(self.normals) else 3
+        return each * (self.measurements - self.landmarks) + 2 * tilts + 3 * self.fixes
 
     def dead_reckoning(self) -> Poses:
         """Poses from the prior of the first one and odometry only."""

@@ -60,16 +60,9 @@ def eliminate_landmarks(detections, poses, landmarks, order, table):
         a, n = ptr[j], ptr[j + 1] - ptr[j]
         for e in range(n):
             i, m = pose[a + e], measurement[a + e]
-            sx, sy, sz, al, be = _seen(
-                _nine(poses.rotation, i),
-                np.float64(detections.points[m, 0]),
-                np.float64(detections.points[m, 1]),
-                np.float64(detections.points[m, 2]),
-                detections.along,
-                detections.across,
-            )
-            W[0], W[1], W[2] = al + be * sx * sx, be * sx * sy, be * sx * sz
-            W[3], W[4], W[5] = al + be * sy * sy, be * sy * sz, al + be * sz * sz
+            nx, ny, nz, al, be = _seen(_nine(poses.rotation, i), detections, m)[3:]
+            W[0], W[1], W[2] = al + be * nx * nx, be * nx * ny, be * nx * nz
+            W[3], W[4], W[5] = al + be * ny * ny, be * ny * nz, al + be * nz * nz
             qx, qy, qz = l[j, 0] - poses.position[i, 0], l[j, 1] - poses.position[i, 1], l[j, 2] - poses.position[i, 2]
             _weighted(W, qx, qy, qz, X[e])
             _add_lever(qx, qy, qz, X[e], 1.0, table.block[_find(table, np.int64(i) * N + i)])

@@ -246,6 +246,8 @@ def relax_skeleton(
             "measurements are on disk; wanted split=False (wrong unions are found in memory) and another method than "
             "'blocks'"
         )
+    if len(problem.normals) and (c.split or poses is None):
+        raise ConfigError("measurements have normals; wanted initial poses, and split=False")
     stages = StageTimes()
     refused = 0
     if poses is None:
@@ -261,10 +263,8 @@ def relax_skeleton(
         descent.run()
         while c.split and descent.split():
             descent.run()
-        soft = []
-        if c.soft:
-            soft = weakest_modes(descent.network, c.soft)
-            stages("softest modes")
+        soft = weakest_modes(descent.network, c.soft) if c.soft else []
+        stages("softest modes")
         network = descent.network
         return RelaxationResult(
             method=c.method,

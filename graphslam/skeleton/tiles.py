@@ -21,6 +21,8 @@ def write_tiled_problem(problem: SkeletonProblem, folder: str | Path, size: int 
     """
     if size < 1:
         raise ConfigError(f"tiles of {size} poses; wanted 1 or more")
+    if len(problem.normals):
+        raise ConfigError("measurements with normals are not written in tiles")
 
     def blocks() -> Iterator[tuple[npt.NDArray[np.int64], Points, Labels]]:
         for a in range(0, problem.poses, size):

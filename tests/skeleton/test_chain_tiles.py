@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -13,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from graphslam.app.cli import app
-from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
+from graphslam.core.errors import ConfigError, DataError, FormatError, GraphSlamError, MissingDataError
 from graphslam.skeleton import chain_tiles as tiles
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
 from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, relax_tiles, tasks_of
@@ -137,19 +134,12 @@ def test_tasks_are_as_long_as_what_was_measured_makes_them(
     assert bytes_of(folders[0]) == bytes_of(folders[1])
 
 
-def test_the_command_relaxes_a_folder(graph: ChainGraph, tmp_path: Path) -> None:
+def test_no_workers_and_no_scheduler_are_refused(graph: ChainGraph, tmp_path: Path) -> None:
     folder = chain_to_disk(tmp_path / "tiles", cut_chain(graph, 25))
-    done = CliRunner().invoke(app, ["relax", str(folder), "--json"], catch_exceptions=False)
-    assert done.exit_code == 0
-    value = json.loads(done.stdout)
-    assert value["converged"]
-    assert value["objective"] == pytest.approx(relax_chain(graph).objective, rel=1e-9)
-    assert (value["tiles"], len(value["poses"])) == (4, 4)
-    assert all((folder / name).is_file() for name in value["poses"])
-    for options, words in ((["--workers", "0"], "at least 1 worker"), (["--cluster", "127.0.0.1:1"], "127.0.0.1:1")):
-        done = CliRunner().invoke(app, ["relax", str(folder), *options])
-        assert done.exit_code != 0
-        assert words in str(done.exception)
+    with pytest.raises(GraphSlamError, match="at least 1 worker"):
+        relax_tiles(folder, workers=0)
+    with pytest.raises(GraphSlamError, match=r"127\.0\.0\.1:1"):
+        relax_tiles(folder, cluster="127.0.0.1:1")
 
 
 def test_a_run_that_was_killed_is_repeated_without_a_changed_byte(graph: ChainGraph, tmp_path: Path) -> None:

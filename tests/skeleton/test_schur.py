@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import (
     KeyframeNetwork,
@@ -14,7 +18,10 @@ from graphslam.skeleton.preconditioner import (
     keyframes_of,
 )
 from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.schur import Network, Workers, WorkRanges
+from graphslam.skeleton.tiles import write_tiled_problem
+from graphslam_studies.sim.laps import Laps
 from tests.reference import dense_skeleton as dense
 
 
@@ -118,3 +125,52 @@ def test_threads_change_no_byte(problem: SkeletonProblem, poses: Poses) -> None:
         found.append((network.objective, *(x.tobytes() for x in made)))
         network.layout.workers.close()
     assert found[0] == found[1] == found[2]
+
+
+def test_points_of_surfaces_against_dense_matrices(problem: SkeletonProblem, laps: Laps) -> None:
+    """Each measures along its normal only; the extent of a landmark holds its position on the surface, and no pose."""
+    rng = np.random.default_rng(6)
+    truth, pose = laps.truth, np.repeat(np.arange(problem.poses), np.diff(problem.first))
+    of_landmark = rng.standard_normal((problem.landmarks, 3))
+    of_landmark /= np.linalg.norm(of_landmark, axis=1, keepdims=True)
+    normals = np.einsum("mji,mj->mi", truth.rotation[pose], of_landmark[problem.landmark])
+    surfaces = replace(problem, normals=normals, range_sigma=0.02, bearing_sigma=0.3, up=None)
+    network = Network(WorkRanges(surfaces, Workers(1)), truth)
+    N, L = problem.poses, problem.landmarks
+    bare = replace(surfaces, points=surfaces.points[:0], normals=normals[:0], landmark=[], first=np.zeros(N + 1, int))
+    chain = dense.rows(bare, truth, np.zeros((0, 3)))
+    H, g = np.zeros((6 * N + 3 * L, 6 * N + 3 * L)), np.zeros(6 * N + 3 * L)
+    H[: 6 * N, : 6 * N] = (chain.jacobian.T @ chain.jacobian).toarray()
+    g[: 6 * N] = chain.jacobian.T @ chain.residual
+    held, sums = np.zeros((L, 3)), np.zeros(L)
+    for m, (i, j) in enumerate(zip(pose, problem.landmark)):
+        n, q = of_landmark[j], network.landmarks[j] - truth.position[i]
+        x = truth.rotation[i] @ problem.points[m].astype(float)
+        J = np.concatenate([np.cross(n, q), -n]) / 0.02  # n · (q × w - u)
+        columns = np.r_[6 * i : 6 * i + 6, 6 * N + 3 * j : 6 * N + 3 * j + 3]
+        row = np.concatenate([J, n / 0.02])
+        H[np.ix_(columns, columns)] += np.outer(row, row)
+        g[columns] += row * (n @ (q - x)) / 0.02
+        own = np.arange(6 * N + 3 * j, 6 * N + 3 * j + 3)
+        H[own, own] += 0.3**-2
+        held[j] += truth.position[i] + x
+        sums[j] += 1
+    assert close(network.landmarks, held / sums[:, None], 1e-5)  # the same normals: the mean in every direction
+    n = 6 * N
+    S = H[:n, :n] - H[:n, n:] @ np.linalg.solve(H[n:, n:], H[n:, :n])
+    assert np.abs(g[n:]).max() < 1e-4 * np.abs(g[:n]).max()  # the landmarks are at their best positions
+    assert close(network.gradient.ravel(), g[:n], 1e-5)
+    v = rng.standard_normal((N, 6))
+    assert close(network.product(v).ravel(), S @ v.ravel(), 1e-6)
+    assert surfaces.freedom == problem.measurements - L + 3 * problem.fixes
+
+
+def test_points_of_surfaces_need_initial_poses_and_unit_normals(problem: SkeletonProblem, tmp_path: Path) -> None:
+    normals = np.tile([0.0, 0.0, 1.0], (problem.measurements, 1))
+    surfaces = replace(problem, normals=normals)
+    with pytest.raises(ConfigError, match="initial poses"):
+        relax_skeleton(surfaces, RelaxConfig(split=False))
+    with pytest.raises(ConfigError, match="tiles"):
+        write_tiled_problem(surfaces, tmp_path)
+    with pytest.raises(DataError, match="unit vectors"):
+        replace(problem, normals=2.0 * normals)

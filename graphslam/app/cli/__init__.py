@@ -69,7 +69,7 @@ GROUPS = {
     "Advanced": {
         "merge": "Merge runs of several robots or days.",
         "localise": "Localise a log or submaps in a saved map.",
-        "relax": "Relax a pose graph that is larger than memory.",
+        "relax": "Relax a run with its scans, as a skeleton network.",
         "options": "List the options of a run or of a front end.",
         "doctor": "Check the installation.",
         "study": "Run a Monte-Carlo study.",

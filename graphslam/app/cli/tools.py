@@ -82,33 +82,48 @@ def solve_command(
 
 
 def relax_command(
-    folder: Path = typer.Argument(..., help="Chain with loops in tiles: a folder that chain_to_disk wrote."),
-    workers: int | None = typer.Option(None, help="Processes that share the tiles. Default: one tile after the other."),
-    cluster: str | None = typer.Option(None, help="host:port of a Dask scheduler whose workers share the tiles."),
+    run: Path = typer.Argument(..., help="Folder of a finished run whose front end uses scans."),
+    out: Path | None = typer.Option(None, "--out", "-o", help="TUM file to write the relaxed path to."),
+    save_plot: Path | None = typer.Option(None, help="Picture of the scans along graph and relaxed path (PNG)."),
     as_json: bool = JSON,
 ) -> None:
-    """Relax a pose graph that is larger than memory: a chain with loops, in tiles on disk."""
-    from graphslam.core.lock import lock_folder
-    from graphslam.skeleton.chain_tiles import relax_tiles
+    """Relax the path of a run with its scans, as a skeleton network of poses, beside the graph of the run."""
+    from graphslam.app.run.skeleton import relax_run
+    from graphslam.core.atomic import check_file_target
+    from graphslam.io.tum import write_tum
 
-    if not folder.is_dir():
-        raise MissingDataError("no such folder", where=str(folder))
-    with lock_folder(folder):
-        found = relax_tiles(folder, workers=workers, cluster=cluster)
-    value = {
-        "folder": str(folder),
-        "tiles": len(found.names),
-        "tasks": len(found.tasks),
-        "separator": found.separator,
-        "objective_initial": found.history[0],
-        "objective": found.objective,
-        "iterations": len(found.history) - 1,
-        "converged": found.converged,
-        "predicted": found.predicted,
-        "largest_move": found.largest_move,
-        "poses": found.names,
+    for file in (out, save_plot):
+        if file is not None:
+            check_file_target(file)
+    made = relax_run(run, None if as_json else lambda text: typer.echo(text, err=True))
+    s = made.skeleton
+    facts: dict[str, Any] = {
+        "poses": s.problem.poses,
+        "measurements": s.problem.measurements,
+        "landmarks": s.problem.landmarks,
+        "outliers": s.outliers,
+        "fixes": s.fixes,
+        "fixes_left": s.fixes_left,
+        "sigma": s.sigma,
+        "chi2": s.relaxation.chi2,
+        "moved": list(s.moved),
     }
-    print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items() if k != "poses"), as_json=as_json)
+    text = text_table(made.rows) + "\n\n" + "\n".join(f"{k:20} {v}" for k, v in facts.items())
+    value: dict[str, Any] = {"run": str(run), "paths": made.rows, **facts}
+
+    def write() -> None:
+        if out is not None:
+            write_tum(out, s.path)
+        if save_plot is not None:
+            from graphslam.plots.refined import plot_scans_along
+            from graphslam.plots.save import save_figure
+
+            points = {k: s.cloud.world(p.poses)[0] for k, p in made.paths.items()}
+            save_figure(plot_scans_along(points, made.paths, title=f"scans of {run.name}"), save_plot)
+
+    files = [str(f) for f in (out, save_plot) if f is not None]
+    written = f"written to {', '.join(files)}" if files else "nothing written; --out writes the path"
+    write_and_print(write, {**value, "files": files}, text, written, as_json=as_json)
 
 
 def evaluate_command(

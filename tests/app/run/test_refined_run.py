@@ -11,9 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import graphslam
+from graphslam.app.cli import app
 from graphslam.app.export import export
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.hypotheses import minimum_entropy_loops, write_minimum_entropy
 from graphslam.app.report.report import make_report
 from graphslam.app.run import outputs, stages, submap_slam
@@ -390,3 +393,28 @@ def test_particles_are_drawn_anew_where_passes_still_deny_each_other(
     assert not shares
     assert again_made.report["map_attempts"] == rows
     assert differing(before, snapshot(folder, SAME_BYTES)) == []
+
+
+def test_a_run_is_relaxed_with_its_scans_beside_its_graph(finished: Run, tmp_path: Path) -> None:
+    assert finished.folder is not None
+    before = snapshot(finished.folder, ["*"])
+    path, picture = tmp_path / "relaxed.tum", tmp_path / "relaxed.png"
+    options = ["--out", str(path), "--save-plot", str(picture), "--json"]
+    done = CliRunner().invoke(app, ["relax", str(finished.folder), *options], catch_exceptions=False)
+    value = json.loads(done.stdout)
+    rows = {row["path"]: row for row in value["paths"]}
+    assert list(rows) == ["graph", "refined", "skeleton"]
+    assert rows["skeleton"]["ate"] < 0.5 * rows["graph"]["ate"]
+    assert rows["skeleton"]["spread"] < 0.7 * rows["graph"]["spread"]
+    assert rows["skeleton"]["seconds"] > 0
+    assert value["measurements"] > 6 * value["poses"]
+    assert len(read_tum(path)) == value["poses"]
+    assert picture.stat().st_size > 10_000
+    assert snapshot(finished.folder, ["*"]) == before
+
+
+def test_a_run_without_scans_is_not_relaxed(copy: Path) -> None:
+    (current_outputs(copy) / "scans.npz").unlink()
+    done = CliRunner().invoke(app, ["relax", str(copy)])
+    assert done.exit_code != 0
+    assert "no scans to relax" in str(done.exception)
