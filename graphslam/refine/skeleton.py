@@ -112,11 +112,13 @@ def find_patches(
         good[good] = _shared(patch[good])
     back = np.swapaxes(rotations(poses), 1, 2)
     normals = rotate_by_step(back, step[good], sums[patch[good]])
-    label = number_by_first_observation(np.unique(patch[good], return_inverse=True)[1])[0] if good.any() else []
+    label = np.zeros(0, np.int32)
+    if good.any():
+        label = number_by_first_observation(np.unique(patch[good], return_inverse=True)[1])[0]
     return PatchObservations(
         (body / count[:, None])[good],
         normals,
-        np.asarray(label, np.int32),
+        label,
         step[good],
         sigma,
         int(before - np.count_nonzero(good)),
@@ -308,7 +310,7 @@ def _fixes(gps: tuple[Gps, Array] | None, steps: Scans, poses: Array) -> Fixes:
         R = rotations(np.asarray(T)[None])[0]
         C = R.T @ z.covariances[inside] @ R
     good = np.einsum("ki,ki->k", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]) < chi2_quantile(0.999, g.dim)
-    position, wide = np.zeros((np.count_nonzero(good), 3)), np.tile(np.eye(3), (np.count_nonzero(good), 1, 1))
+    position, wide = np.zeros((int(good.sum()), 3)), np.tile(np.eye(3), (int(good.sum()), 1, 1))
     position[:, : g.dim] = (poses[k, : g.dim] + off)[good]
     wide[:, : g.dim, : g.dim] = C[good]
     return k[good], position, wide
