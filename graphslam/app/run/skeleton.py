@@ -72,7 +72,7 @@ def relax_run(folder: str | Path, progress: Callable[[str], Any] | None = None) 
     if run.fixes is not None and len(run.fixes.times) and run.map.T_gps_world is not None:
         bias = RunOptions.of_folder(root).settings.gps.bias_sigma or 0.0
         gps = replace(run.fixes, sigma=np.hypot(run.fixes.sigma, bias)), run.map.T_gps_world
-    rows = []
+    rows: list[dict[str, Any]] = []
     with one_blas_thread():
         for work in (lambda: resolve_from_folder(root), lambda: relax_scans(scans, start, gps=gps, progress=progress)):
             begin = time.process_time()
