@@ -26,7 +26,6 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import GpsFactors
-from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
 from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_events, same_loop
@@ -49,7 +48,6 @@ def find_config(c: BackEndConfig) -> FindConfig:
     """Configuration of the loop search; front-end matches are included."""
     return FindConfig(
         candidates=CandidateConfig(overlap=LOOP_OVERLAP, height=LOOP_HEIGHT, least_support=c.match_support),
-        appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
         rounds=FindConfig().rounds if c.looks else 0,
     )

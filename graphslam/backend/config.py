@@ -97,8 +97,6 @@ class BackEndConfig:
     draws; the map with the fewest contradictory points is kept; 1 = never."""
     look_every: int = 5
     """During the run, add IMU factors and search for loops after this number of submaps; 0 = only at the end."""
-    loop_appearance: bool = False
-    """Also test places that look alike, at any distance."""
 
     @property
     def looks(self) -> bool:
