@@ -320,7 +320,7 @@ def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Predicti
 def heading_cover(e: Array, variances: Array, stated: Array) -> float | None:
     """Factor on the estimated σ of the heading with which it covers every error, if the log's σ is clearly larger.
 
-    Matches are taken as exact, so inaccurate ones give no small σ. The σ of distances is never replaced by a smaller
+    Matches are assumed exact, so inaccurate ones give no small σ. The σ of distances is never replaced by a smaller
     one: wheels that slip or run backwards change distances, and rarely.
 
     Parameters
