@@ -114,6 +114,10 @@ def _spatial(records: Records, build: NetworkBuilder, noise: Noise) -> PoseNetwo
     vertices, edges = records.rows["VERTEX3"], records.rows["EDGE3"]
     build.add_vertices(vertices.whole[:, 0], _euler_poses(vertices.real), vertices.lines)
     name: Noise = "information" if noise in ("auto", "toro") else noise
+    if noise == "auto" and not np.isin(edges.real[:, 6:], (0.0, 1.0)).all():  # else both are the same
+        log.warning(
+            "%s: EDGE3 is read as information; if it is its square root: --noise sqrt-information", records.path
+        )
     information = _information(edges.real[:, 6:], name, build, edge_labels(edges.whole))
     build.noise = "information, TORO order" if name == "information" else name
     build.add_edges(edges.whole, _euler_poses(edges.real[:, :6]), information[:, SWAP][:, :, SWAP], edges.lines)
@@ -137,13 +141,12 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
             if name == "covariance" and (turn := float(np.median(columns[:, 5]))) > UNKNOWN_TURN:
                 # σ is √c for a covariance, 1 / c for a square root of the information
                 name = "covariance" if turn <= 1.0 else "sqrt-information"
-                log.warning(
+                sigma = np.sqrt(turn) if name == "covariance" else 1.0 / turn
+                text = (
                     "%s: noise columns are read as %s, so that σ of a turn is %.2g rad; if they mean something else: "
-                    "--noise covariance (GTSAM) or sqrt-information (iSAM)",
-                    records.path,
-                    name,
-                    np.sqrt(turn) if name == "covariance" else 1.0 / turn,
                 )
+                text += "--noise covariance (GTSAM) or sqrt-information (iSAM)"
+                log.warning(text, records.path, name, sigma)
             return name
     odd = np.flatnonzero((nonzero != np.isin(np.arange(6), [0, 3, 5])).any(axis=1))
     raise FormatError(

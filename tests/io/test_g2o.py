@@ -291,7 +291,7 @@ EQUIV 0 1
 """
 
 
-def test_three_dimensions_of_toro_and_isam(tmp_path: Path) -> None:
+def test_three_dimensions_of_toro_and_isam(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The optimum is that of GTSAM with the same matrices, their rows put in its order (rotation first)."""
     r = np.random.default_rng(4)
     R = [np.triu(0.3 * r.normal(size=(6, 6)), 1) + np.diag(r.uniform(2, 9, 6)) for _ in range(2)]
@@ -304,6 +304,8 @@ def test_three_dimensions_of_toro_and_isam(tmp_path: Path) -> None:
     ):
         a, b = (" ".join(format(v, ".17g") for v in m[upper]) for m in columns)
         net = read_network(put(tmp_path, TORO_3D.format(a=a, b=b), "t.graph"), noise=noise)  # type: ignore[arg-type]
+        assert ("EDGE3 is read as information" in caplog.text) == (noise == "auto")
+        caplog.clear()
         np.testing.assert_allclose(net.information[0], information[0][swap][:, swap], rtol=1e-9, atol=1e-9)
         graph = gtsam.NonlinearFactorGraph()
         graph.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3()))
