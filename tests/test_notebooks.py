@@ -147,7 +147,7 @@ def test_internal_imports_are_found() -> None:
 @every_notebook
 def test_a_lecture_has_a_setting_to_change_and_exercises(path: Path) -> None:
     cells = nbformat.read(path, as_version=4).cells
-    assert sum(bool(re.search(r"\bknob\(", c.source)) for c in cells if c.cell_type == "code") == 1
+    assert sum(bool(re.search(r"\bplot_settings\(", c.source)) for c in cells if c.cell_type == "code") == 1
     assert sum("**Change a parameter.**" in c.source for c in cells if c.cell_type == "markdown") == 1
     assert sum("## Exercises" in c.source for c in cells if c.cell_type == "markdown") == 1
 

@@ -115,9 +115,7 @@ def _spatial(records: Records, build: NetworkBuilder, noise: Noise) -> PoseNetwo
     build.add_vertices(vertices.whole[:, 0], _euler_poses(vertices.real), vertices.lines)
     name: Noise = "information" if noise in ("auto", "toro") else noise
     if noise == "auto" and not np.isin(edges.real[:, 6:], (0.0, 1.0)).all():  # else both are the same
-        log.warning(
-            "%s: EDGE3 is read as information; if it is its square root: --noise sqrt-information", records.path
-        )
+        log.warning("%s: EDGE3 is read as information; if a square root of it: --noise sqrt-information", records.path)
     information = _information(edges.real[:, 6:], name, build, edge_labels(edges.whole))
     build.noise = "information, TORO order" if name == "information" else name
     build.add_edges(edges.whole, _euler_poses(edges.real[:, :6]), information[:, SWAP][:, :, SWAP], edges.lines)
