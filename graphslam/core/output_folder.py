@@ -88,8 +88,8 @@ def output_folder(path: str | os.PathLike[str], kind: str, *, last: Sequence[str
     """
     home = check_folder_target(path, kind)
     made = not home.exists()
-    try:
-        with lock_folder(home):
+    with lock_folder(home):
+        try:
             before = _listed(home, kind)
             check_file_target(home / LISTED)  # removes what a killed writer left beside it
             staged = home / STAGED
@@ -101,11 +101,11 @@ def output_folder(path: str | os.PathLike[str], kind: str, *, last: Sequence[str
                     _move(home, staged, kind, before, last)
             finally:
                 shutil.rmtree(staged, ignore_errors=True)
-    except BaseException:
-        if made and home.is_dir() and os.listdir(home) == [LOCK]:
-            (home / LOCK).unlink()
-            home.rmdir()
-        raise
+        except BaseException:  # only with the lock: another process may have begun to write
+            if made and home.is_dir() and os.listdir(home) == [LOCK]:
+                (home / LOCK).unlink()
+                home.rmdir()
+            raise
 
 
 def _move(home: Path, staged: Path, kind: str, before: list[str], last: Sequence[str]) -> None:

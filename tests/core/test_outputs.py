@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphslam.core import output_folder as outputs
 from graphslam.core.atomic import atomic_open, check_file_target, part_path, read_npz, write_npz
-from graphslam.core.errors import FormatError, OutputError
+from graphslam.core.errors import FormatError, OutputError, RunFolderError
 from graphslam.core.lock import LOCK, is_lock
 from graphslam.core.npz import read_arrays
 from graphslam.core.output_folder import LISTED, check_folder_target, output_folder
@@ -113,6 +114,23 @@ def test_a_failure_leaves_the_old_output_or_no_folder(tmp_path: Path) -> None:
             fail_in(folder)
     assert seen(home) == {"index": "old"}
     assert not (tmp_path / "fresh").exists()
+
+
+def test_a_folder_that_another_process_has_just_made_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the check of the target and the lock: its lock file was removed, and then both processes failed."""
+    home = tmp_path / "out"
+
+    def busy(folder: Path) -> None:
+        folder.mkdir()
+        (folder / LOCK).write_text("graphslam: this folder is written by process 1\n")
+        raise RunFolderError("process 1 is writing into it")
+
+    monkeypatch.setattr(outputs, "lock_folder", busy)
+    with pytest.raises(RunFolderError), output_folder(home, "log", last=()):
+        raise AssertionError("not reached")
+    assert is_lock(home / LOCK)
 
 
 @pytest.mark.parametrize("after", range(1, 9))

@@ -40,7 +40,6 @@ from graphslam.app import cli
 from graphslam.app.run import outputs
 from graphslam.app.sessions import merge_outputs
 from graphslam.core.atomic import is_part
-from graphslam.skeleton.chain_tiles import chain_to_disk
 from graphslam_studies.montecarlo import folder as study_folder
 from tests.faults.kills import (
     ROOT,
@@ -55,8 +54,6 @@ from tests.faults.kills import (
     snapshot,
 )
 from tests.pictures import save_point
-from tests.reference.chain_pieces import cut_chain
-from tests.skeleton.test_chain_graph import drawn
 
 PATIENCE = 600.0
 """Seconds after which a case hangs."""
@@ -117,7 +114,6 @@ FLAT = {
         _path("export", "@a", "--format", "ros2", "--out", "@out"), ("out/*.db3", "out/*.yaml"), "folder"
     ),
     "init": Verb(_path("init", "@log", "--force", "--out", "@out.toml"), ("out.toml",), "file"),
-    "relax": Verb(_path("relax", "@chain"), ("chain/chain.json",)),
     "study": Verb(
         _path("study", STUDY, "--trials", "2", "--quick", "--json", "--out", "@out"), study_folder.SAME_BYTES, "folder"
     ),
@@ -147,6 +143,7 @@ DENSE = {
         "folder",
     ),
     "export mcap": Verb(_path("export", "@out", "--format", "mcap", "--out", "@out2.mcap"), ("out2.mcap",), "file"),
+    "relax": Verb(_path("relax", "@out", "--out", "@out2.tum"), ("out2.tum",), "file"),
     "localise": Verb(lambda work: ["localise", str(work / "out"), str(work / "out"), "--submap", "0"]),
     "demo": Verb(
         _path("demo", "--preset", "quick", "--json", "--out", "@out2"),
@@ -157,9 +154,8 @@ DENSE = {
 
 
 def flat(work: Path) -> None:
-    """A log and two runs of it, and a chain in tiles."""
+    """A log and two runs of it."""
     log_2d(work)
-    chain_to_disk(work / "chain", cut_chain(drawn(99, [(2, 95), (10, 40), (60, 90)], seed=2)[0], 20))
     for name, seed in (("a", 5), ("b", 6)):
         called(arguments_2d(work, name, seed))
 

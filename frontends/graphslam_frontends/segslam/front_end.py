@@ -79,19 +79,6 @@ class SegSlam(StepwiseFrontEnd):
         found = next((what for what, so in reasons.items() if so), needs_whole_log(c.steps))
         return f"frontend.{found} needs the whole log" if found else ""
 
-    def submaps(
-        self,
-        log: SensorLog,
-        *,
-        seed: SeedTree,
-        after: Submap | None = None,
-        drops: DropCounter | None = None,
-        watch: Watch | None = None,
-    ) -> Iterator[Submap]:
-        """See :class:`~graphslam_frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
-        found = self.follow(RecordSource(log), seed=seed, after=after, drops=drops, watch=watch)
-        return (submap for submap in found if submap is not None)
-
     def follow(
         self,
         feed: RecordSource,
@@ -101,7 +88,7 @@ class SegSlam(StepwiseFrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`~graphslam_frontends.base.FrontEnd`."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
         first, key = 0 if after is None else after.key + 1, -1
         found: SegSlamFilter | SegSlamResult | None = None
         for found in self._filtered(feed, seed, drops, watch):
