@@ -174,6 +174,12 @@ def test_mine_and_building_measure_what_they_are_for(tables: dict[str, tuple[pd.
     assert mean(table, "segslam-5", "loops_closed") == 1.0
     assert mean(table, "dead-reckoning", "loops_closed") == 0.0
     assert mean(table, "segslam-5", "merged_parallels") == 0.0
+    fewest, best, most = (mean(table, "rbpf-5", f"loops_closed{of}") for of in ("_fewest", "", "_most"))
+    assert fewest <= best <= most
+    assert 1 <= mean(table, "rbpf-5", "particle_paths") <= 5
+    assert 0.0 < mean(table, "rbpf-5", "common_path") < 1.0
+    assert 1.0 < mean(table, "rbpf-5", "alternatives") == mean(table, "rbpf-5", "survivors") < 5.0
+    assert 1.0 <= mean(table, "segslam-5", "survivors") < mean(table, "segslam-5", "alternatives") <= 5.0
     assert mean(timings, "segslam-5", "seconds_step_last_quarter") > 0.0
     table, _ = tables["segslam-building"]
     assert mean(table, "segslam-5", "entropy_min") <= mean(table, "segslam-5", "entropy")
@@ -299,6 +305,21 @@ def test_merged_stretches_of_a_hand_case() -> None:
     assert merged(65, 15) == merged(15, 65) == 1
     assert merged(65, 62) == merged(65, 30) == merged(5, 65) == 0
     assert merged(65, 15, 0.2) == 0
+
+
+def test_overlapping_stretches_of_a_hand_case() -> None:
+    arc = np.arange(0.0, 101.0)
+    truth = np.zeros((101, 7))
+    truth[:, 0] = np.minimum(arc, 60.0) - np.maximum(arc - 60.0, 0.0)  # forth, and back beside it
+    truth[:, 1] = 8.0 * (arc > 60.0)
+    pairs = [[[20.0, 50.0], [70.0, 100.0]]]
+
+    def overlapping(apart: float) -> int:
+        path = truth.copy()
+        path[arc > 60.0, 1] = apart
+        return judge.overlapping_stretches(path, truth, arc, pairs)
+
+    assert [overlapping(a) for a in (8.0, 4.1, 3.9, -3.9, -4.1)] == [0, 0, 1, 1, 0]
 
 
 def test_second_visits_and_legs_of_hand_cases() -> None:

@@ -9,8 +9,15 @@ Quantities, besides those of ``segslam-garage``
 end of the second [m]; for SegSLAM from a map sample that starts at that time.
 ``loops``: such sections driven in the same direction (the scanner points ahead, so it sees other surfaces on the way
 back); ``loops_closed``: those with an error below 1 m; ``all_closed``. ``merged_parallels``: matches of one of two
-parallel sections with the other. Timings: ``seconds_step_first_quarter`` and ``…_last_quarter``, mean
-time of a step; ``maps_megabytes``.
+parallel sections with the other. ``overlapping_parallels``: of the ``parallels`` pairs of such sections, those less
+than half as far apart in the map as in truth. Timings: ``seconds_step_first_quarter`` and ``…_last_quarter``, mean time
+of a step; ``maps_megabytes``.
+
+Of the maps of all particles of an RBPF (``particle_paths`` different ones): ``loops_closed_fewest`` and ``…_most``,
+``overlapping_parallels_fewest`` and ``…_most``, ``particle_visit_error_least`` and ``…_greatest`` of every loop.
+``common_path``: share of the path before the last common ancestor of all particles. Means over the path, in every
+study of grid front ends: ``survivors``, ancestors of the particles of the end; ``alternatives``, different pieces of
+path: the survivors of an RBPF, the viable segments of SegSLAM.
 """
 
 from __future__ import annotations
@@ -33,17 +40,26 @@ _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
 SEGSLAM = SegSlamConfig(winnowing=SegmentCandidateConfig(height_per_metre=7e-3))
 _MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
 WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
+_OF_PARTICLES = (
+    *("loops_closed", "loops_closed_fewest", "loops_closed_most", "overlapping_parallels"),
+    *("overlapping_parallels_fewest", "overlapping_parallels_most", "particle_paths", "common_path"),
+    *("survivors", "alternatives"),
+)
 QUICK_WORLDS = {
     "court-quick": replace(QUICK, algorithms=(DEAD_RECKONING, "rbpf-5", "segslam-5"), figures=_FIGURES),
 }
+PARTICLE_WORLDS = {f"mine-{n}": replace(_MINE, algorithms=(f"rbpf-{n}",)) for n in (200, 500, 1000)}
+PARTICLE_WORLDS["mine-20"] = replace(_MINE, algorithms=("rbpf-20", "segslam-20"))
+"""Worlds with one number of particles each, so that trials are short; the runs are those of ``mine``."""
 
 
 class SegSlamMine(GridStudy):
     """See the module."""
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``loops``, ``visits`` one by one, ``matches``, ``paths``, ``nees``, ``seconds`` by part."""
+        """``loops``, ``visits`` one by one, ``particles``, ``matches``, ``paths``, ``nees``, ``seconds`` by part."""
         out = {"loops": tables.loop_table(table, timings), "visits": visit_table(table)}
+        out["particles"] = tables.means_table(table, _OF_PARTICLES)
         out["matches"] = tables.match_table(table)
         out["paths"] = tables.means_table(table, ("final_error", "ate_anchored", "ate_aligned", "maps_megabytes"))
         out["nees"] = tables.nees_table(table)
@@ -78,4 +94,11 @@ STUDY = SegSlamMine(
     "1.3 km of mine with loops within loops and parallel galleries: loops closed, galleries merged, cost of a step",
     WORLDS,
     QUICK_WORLDS,
+)
+PARTICLES = SegSlamMine(
+    "mine-particles",
+    "the mine with more particles of the RBPF, up to 1,000 as in the paper: loops closed, parallel galleries merged",
+    PARTICLE_WORLDS,
+    QUICK_WORLDS,
+    trials=5,
 )

@@ -212,6 +212,12 @@ class GridTrial:
             effective = result.effective / result.report()["particles"]
             yield Measurement(name, "effective_median", float(np.median(effective)))
             yield Measurement(name, "maps_megabytes", result.used_bytes / 1e6)
+            survivors = float(result.ancestry.survivors().mean())
+            yield Measurement(name, "survivors", survivors)
+            if isinstance(result, SegSlamResult):
+                t, alive = result.segmap.table, result.segmap.alive
+                survivors = float(np.sum(t.end[alive] - t.start[alive])) / len(self.steps)
+            yield Measurement(name, "alternatives", survivors)
         if "legs" in wanted:
             yield Measurement(name, "leg_angle", self.leg_angle(outcome.path.poses))
         if "climbs" in wanted:
@@ -313,7 +319,7 @@ class GridTrial:
 
     def _loops(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
         """Errors between first and second visit of a place; a loop is closed if the error is small."""
-        closed = []
+        closed, wanted = [], []
         for k, r in enumerate(self.world.meta["revisits"]):
             first, again = (judge.nearest(self.arc, float(r[which][1])) for which in ("first", "again"))
             path = outcome.path
@@ -323,9 +329,32 @@ class GridTrial:
             yield Measurement(name, "visit_error", error, k)
             if r["same_heading"]:
                 closed.append(error <= judge.CLOSED_DISTANCE)
+                wanted.append((first, again))
         yield Measurement(name, "loops", len(closed))
         yield Measurement(name, "loops_closed", int(np.sum(closed)))
         yield Measurement(name, "all_closed", float(all(closed)))
+        if pairs := self.world.meta["parallel"]:
+            count = judge.overlapping_stretches(outcome.path.poses, self.truth, self.arc, pairs)
+            yield Measurement(name, "overlapping_parallels", count)
+            yield Measurement(name, "parallels", len(pairs))
+        if isinstance(outcome.result, RbpfResult):
+            yield from self._every_particle(name, outcome.result, wanted)
+
+    def _every_particle(self, name: str, result: RbpfResult, loops: list[tuple[int, int]]) -> Iterator[Measurement]:
+        """The same of the maps of all particles: the fewest, the most; and the share of the path common to all."""
+        paths = np.swapaxes(result.ancestry.paths(), 0, 1)
+        paths = paths[judge.distinct(paths, len(paths))]
+        error = np.array([[judge.visit_error(p, self.truth, *at) for at in loops] for p in paths])
+        overlapping = [judge.overlapping_stretches(p, self.truth, self.arc, self.world.meta["parallel"]) for p in paths]
+        closed = np.sum(error <= judge.CLOSED_DISTANCE, axis=1)
+        yield Measurement(name, "particle_paths", len(paths))
+        yield Measurement(name, "common_path", (result.ancestry.coalescence() + 1) / len(result.times))
+        for quantity, values in (("loops_closed", closed), ("overlapping_parallels", overlapping)):
+            yield Measurement(name, f"{quantity}_fewest", int(np.min(values)))
+            yield Measurement(name, f"{quantity}_most", int(np.max(values)))
+        for k in range(len(loops)):
+            yield Measurement(name, "particle_visit_error_least", float(error[:, k].min()), k)
+            yield Measurement(name, "particle_visit_error_greatest", float(error[:, k].max()), k)
 
     def _path(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
         """Path points x, y with the number of their segment; and the true ones."""

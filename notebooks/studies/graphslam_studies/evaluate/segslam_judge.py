@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array, arc_length, wrap_angle
 from graphslam.core.poses import group_of, heading_of, remove_roll_pitch
@@ -235,6 +236,22 @@ def merged_stretches(matches: MatchErrors, arc: Array, pairs: Sequence[Sequence[
     for a, b in pairs:
         merged |= (within(here, a) & within(there, b)) | (within(here, b) & within(there, a))
     return int(np.sum(merged & matches.false))
+
+
+def overlapping_stretches(path: Array, truth: Array, arc: Array, pairs: Sequence[Sequence[Sequence[float]]]) -> int:
+    """Pairs of parallel stretches that are less than half as far apart in the path as in truth: galleries overlap.
+
+    Distance: median over the first stretch of the distance to the nearest point of the second, in plan.
+    """
+
+    def apart(poses: Array, one: slice, other: slice) -> float:
+        return float(np.median(cKDTree(poses[other, :2]).query(poses[one, :2])[0]))
+
+    def steps(s: Sequence[float]) -> slice:
+        return slice(nearest(arc, min(s)), nearest(arc, max(s)) + 1)
+
+    at = [(steps(one), steps(other)) for one, other in pairs]
+    return sum(apart(path, *p) < 0.5 * apart(truth, *p) for p in at)
 
 
 def visit_error(path: Array, truth: Array, first: int, again: int) -> float:
