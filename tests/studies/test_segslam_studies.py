@@ -23,8 +23,10 @@ from graphslam_studies import segslam_trial
 from graphslam_studies.evaluate import segslam_judge as judge
 from graphslam_studies.frontends.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study, fingerprint
+from graphslam_studies.segslam_building import PARTICLES as MORE_BUILDING
 from graphslam_studies.segslam_building import STUDY as BUILDING
 from graphslam_studies.segslam_garage import STUDY as GARAGE
+from graphslam_studies.segslam_mine import PARTICLES as MORE_MINE
 from graphslam_studies.segslam_mine import STUDY as MINE
 from graphslam_studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
 from tests.pictures import full_pictures
@@ -100,6 +102,15 @@ def test_the_garage_is_compared_at_the_papers_numbers_of_particles() -> None:
         for family in ("rbpf", "segslam"):
             assert [family_of(a)[1] for a in names if family_of(a)[0] == family] == [1, 5, 10, 20, 40, 100]
     assert {GARAGE.full[w].layout for w in GARAGE.worlds(False)} == {"A", "B", "C", "D", "drawn"}
+
+
+def test_more_particles_run_in_the_same_worlds() -> None:
+    for study, name, most in ((MORE_MINE, "mine", 1000), (MORE_BUILDING, "building", 800)):
+        base = {"mine": MINE, "building": BUILDING}[name].full[name]
+        for world, config in study.full.items():
+            assert replace(config, algorithms=base.algorithms) == base
+            assert world == f"{name}-{family_of(config.algorithms[0])[1]}"
+        assert f"{name}-{most}" in study.full
 
 
 def test_names_of_algorithms() -> None:

@@ -1,7 +1,8 @@
 """The study ``segslam-building``: map entropy in a building with corridors on three levels, driven out and back.
 
 Worlds: ``building``, ``building-drawn`` (random layout); clutter and sensor errors are random in each run. Algorithms:
-``dead-reckoning``, ``rbpf-N``, ``segslam-40``.
+``dead-reckoning``, ``rbpf-N``, ``segslam-40``. The study ``building-particles`` runs the RBPF with 200, 400 and 800
+particles in the same runs.
 
 Quantities, besides path errors and times
 -----------------------------------------
@@ -41,6 +42,8 @@ _BUILDING = GridTrialConfig(
     segslam=SEGSLAM,
     steps=LEVEL,
 )
+PARTICLE_WORLDS = {f"building-{n}": replace(_BUILDING, algorithms=(f"rbpf-{n}",)) for n in (200, 400, 800)}
+"""Worlds with one number of particles each, so that trials are short; the runs are those of ``building``."""
 WORLDS = {"building": _BUILDING, "building-drawn": replace(_BUILDING, layout="drawn")}
 QUICK_WORLDS = {
     "court-quick": replace(
@@ -86,4 +89,11 @@ STUDY = SegSlamBuilding(
     "three levels of out-and-back corridors: least map entropy over samples, path and angles of RBPF and SegSLAM",
     WORLDS,
     QUICK_WORLDS,
+)
+PARTICLES = SegSlamBuilding(
+    "building-particles",
+    "the building with more particles of the RBPF, up to 800 as in the paper: least map entropy, path and angles",
+    PARTICLE_WORLDS,
+    QUICK_WORLDS,
+    trials=3,
 )
