@@ -1,8 +1,8 @@
 """The study ``segslam-mine``: nested loops, and two parallel galleries that must not be merged.
 
 Worlds: ``mine``, ``mine-drawn`` (random layout); clutter and sensor errors are random in each run. Algorithms:
-``dead-reckoning``, ``rbpf-20``, ``segslam-20``. The study ``mine-particles`` runs the RBPF with up to 1,000 particles in
-the same runs.
+``dead-reckoning``, ``rbpf-20``, ``segslam-20``. In the study ``mine-particles`` the RBPF has up to 1,000 particles,
+in the same runs.
 
 Quantities, besides those of ``segslam-garage``
 -----------------------------------------------
