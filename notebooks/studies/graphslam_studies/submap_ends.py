@@ -68,7 +68,7 @@ PAIRS = (
     *((f"paper/rule-{n}", f"paper/fixed-{f}") for n in (15, 30, 60) for f in (30, 60, 120, 240)),
     *((f"paper/rule-{n}", f"paper/features-{n}") for n in (15, 30, 60)),
     *(("paper/rule-30", f"paper/rule-30-no-{part}") for part in ("time", "diversity")),
-    ("paper/rule-30-early", "paper/rule-30"),
+    *(("paper/rule-30-early", f"paper/{s}") for s in ("rule-30", "fixed-30", "fixed-60", "fixed-120")),
     *((f"paper/features-{n}", "paper/features-30") for n in (6, 15, 60)),
     *(("default/rule-30", f"default/{s}") for s in ("fixed-60", "fixed-240", "rule-15", "rule-60", "own")),
 )
