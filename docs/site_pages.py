@@ -25,6 +25,7 @@ from mkdocs.structure.files import File, Files
 from docs.notebook_outputs import NOTEBOOKS, cached
 
 ROOT = Path(__file__).resolve().parents[1]
+ROLE = re.compile(r":(?:func|class|meth|mod|attr|data|exc):(<code>)~?")
 LINK = re.compile(r"\[([^\[\]]*)\]\((?!https?://|#|mailto:)([^)\s#]+)(#[^)]*)?\)")
 
 
@@ -78,6 +79,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 FORMULA = re.compile(r"^\$\$\n(.+?)\n\$\$$", re.M | re.S)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Names in docstrings are shown as code, without the roles of Sphinx before them."""
+    return ROLE.sub(r"\1", html)
 
 
 def typeset(tex: str) -> str:

@@ -16,6 +16,7 @@ pytest.importorskip("latex2mathml")
 
 from docs import notebook_outputs, site_pages
 
+ROOT = Path(__file__).resolve().parents[1]
 PNG = base64.b64encode(b"a picture").decode()
 
 
@@ -90,3 +91,17 @@ def test_a_page_for_users_ends_with_the_next_page(part: str, text: str, added: b
     page = SimpleNamespace(ancestors=[SimpleNamespace(title=part)], next_page=to, content=text, file=None)
     site_pages.on_page_context({}, page, None, None)
     assert page.content.endswith('<p>Next: <a href="b.html">A &amp; B</a>.</p>') == added
+
+
+def test_reference_shows_names_without_roles() -> None:
+    shown = site_pages.on_page_content("for :func:<code>run</code> and :class:<code>~a.B</code>", None, None, None)
+    assert shown == "for <code>run</code> and <code>a.B</code>"
+
+
+def test_search_works_in_pages_from_disk_and_loads_nothing_from_elsewhere() -> None:
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert "\n  - offline\n" in config  # writes the index as a script, which such a page may load
+    [scripts] = re.findall(r"^  polyfills: \[(.*?)\]", config, re.MULTILINE)
+    for name in scripts.split(", "):
+        assert "//" not in name and (ROOT / "docs" / name).exists()
+    assert "iframe-worker" in scripts  # else the plugin adds one from a server
