@@ -288,7 +288,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None, fov: float 
     for at, line in enumerate(read_text(path).splitlines(), start=1):
         found = CARMEN_SCANS.match(line)
         if found:
-            rows.setdefault(found[1], []).append((at, line.split()))
+            rows.setdefault(found[1], []).append((at, [found[1], *line[found.end() :].split()]))
         elif line.startswith("PARAM "):
             settings.read(line)
         elif line.startswith("ODOM "):

@@ -417,13 +417,13 @@ def unpack_lzf(data: bytes, size: int, where: str) -> bytes:
 def _las(raw: bytes, where: str) -> CloudData:
     laspy = import_extra("laspy", "a LAS file", where=where)
     n = _las_count(raw, len(raw), where)  # before laspy allocates
-    if raw[104] & 0x80 and n:
-        _check_chunks(raw, where)
     try:
+        if raw[104] & 0x80 and n:
+            _check_chunks(raw, laspy.open(io.BytesIO(raw)).header, where)
         las = laspy.read(io.BytesIO(raw))
         xyz = np.column_stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)]).astype(np.float64)
         times = np.asarray(las.gps_time, np.float64) if "gps_time" in set(las.point_format.dimension_names) else None
-    except (MemoryError, KeyboardInterrupt):
+    except (MemoryError, KeyboardInterrupt, FormatError):
         raise
     except BaseException as error:  # laspy and lazrs raise other types, also panics of Rust
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
@@ -437,7 +437,8 @@ def _las(raw: bytes, where: str) -> CloudData:
 def _las_count(head: bytes, length: int, where: str) -> int:
     if len(head) < 227:
         raise FormatError("LAS header is truncated", where=where, got=f"{len(head)} bytes", wanted="227 or more")
-    n = max(int(np.frombuffer(head[107:111], "<u4")[0]), _count_14(head))
+    large = head[247:255] if head[25] >= 4 and len(head) >= 255 else b""
+    n = max(int.from_bytes(head[107:111], "little"), int.from_bytes(large, "little"))
     size = int(np.frombuffer(head[105:107], "<u2")[0])
     if not head[104] & 0x80 and n * size > length:
         raise FormatError("file is truncated", where=where, got=f"{length} bytes", wanted=f"{n} points of {size}")
@@ -452,18 +453,17 @@ def _las_count(head: bytes, length: int, where: str) -> int:
     return n
 
 
-def _check_chunks(raw: bytes, where: str) -> None:
-    """Check the chunk table of a LAZ file: the decoder allocates its size and aborts the process if it is too large."""
-    first = int(np.frombuffer(raw[96:100], "<u4")[0])
-    at = int(np.frombuffer(raw[first : first + 8].ljust(8, b"\0"), "<i8")[0])
-    if at == -1:  # written as a stream: the offset is in the last 8 bytes
-        at = int(np.frombuffer(raw[-8:], "<i8")[0])
-    if not first <= at <= len(raw) - 8:
+def _check_chunks(raw: bytes, header: Any, where: str) -> None:
+    """Check sizes in a LAZ file: the decoder aborts the process or prints on stderr (a panic) if they are wrong."""
+    first = header.offset_to_point_data
+    at = int.from_bytes(raw[first : first + 8], "little", signed=True)
+    at = int.from_bytes(raw[-8:], "little") if at == -1 else at  # written as a stream: it is in the last 8 bytes
+    if not first <= at <= len(raw) - 8 or int(np.frombuffer(raw[at + 4 : at + 8], "<u4")[0]) > len(raw):
         raise FormatError("LAZ is truncated: its table of chunks is not there", where=where, got=f"{len(raw)} bytes")
-    chunks = int(np.frombuffer(raw[at + 4 : at + 8], "<u4")[0])
-    if chunks > len(raw):
-        raise FormatError("LAZ table claims too many chunks", where=where, got=chunks, wanted=f"in {len(raw)} bytes")
-
-
-def _count_14(raw: bytes) -> int:
-    return int(np.frombuffer(raw[247:255], "<u8")[0]) if raw[25] >= 4 and len(raw) >= 255 else 0
+    lazrs = import_extra("lazrs", "a LAZ file", where=where)
+    packing = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
+    points = io.BytesIO(raw)
+    points.seek(first)
+    sizes = [size for _, size in lazrs.read_chunk_table(points, packing)]
+    if packing.item_size() != header.point_format.size or sum(sizes) > len(raw):
+        raise FormatError("LAZ is damaged: the size of its points or chunks is impossible", where=where)

@@ -118,7 +118,9 @@ FLAT = {
         _path("study", STUDY, "--trials", "2", "--quick", "--json", "--out", "@out"), study_folder.SAME_BYTES, "folder"
     ),
     "merge": Verb(
-        _path("merge", "@a", "@b", "--out", "@out"), tuple(f"out/{p}" for p in merge_outputs.SAME_BYTES), "folder"
+        _path("merge", "@a", "@b", "--out", "@out"),
+        tuple(f"out/{p}" for p in merge_outputs.SAME_BYTES if not p.endswith(".png")),
+        "folder",
     ),
     "eval": Verb(_path("eval", "@a/trajectory.tum", "@b/trajectory.tum")),
     "loops": Verb(_path("loops", "@a")),
@@ -446,7 +448,7 @@ def _streams(b: Bench, verb: Verb, asked: list[str], operations: int, states: An
 
 
 def _memory(b: Bench, verb: Verb, asked: list[str], operations: int, states: Any) -> Cases:
-    if verb.same == ("out.png",):  # a process of its own draws a real picture
+    if verb.same in (("out.png",), ("out.html",)):  # a process of its own draws real pictures
         states = None
     for limit in MEMORY:
         yield f"{limit} MB", lambda m=limit: executed(asked, memory=m), {0, 1}, comparable(verb, states)

@@ -1,8 +1,8 @@
 """Fuzz every reader: ``python -m tests.faults.fuzz --cases 10000 [--reader NAME] [--seed N] [--case K]``.
 
 A damaged input must be refused with an error of our own, or be read with every number finite. Anything else counts
-against the reader: another exception, the end of the process by a signal, more than 20 s, or more than 1 GB beyond what
-the process held before. Case k of a reader is the same for the same seed, whichever process runs it.
+against the reader: another exception, the end of the process by a signal, text on stderr, more than 20 s, or more than
+1 GB beyond what the process held before. Case k of a reader is the same for the same seed, whichever process runs it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from tests.faults.readers import READERS, Reader
 
 SECONDS = 20
 MEMORY = 1 << 30
-KINDS = ("refused", "accepted", "traceback", "hang", "blow-up", "signal", "not-finite")
+KINDS = ("refused", "accepted", "traceback", "hang", "blow-up", "signal", "not-finite", "printed")
 BAD = frozenset(KINDS[2:])
 
 
@@ -98,6 +98,18 @@ def guarded() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+@contextlib.contextmanager
+def stderr_in(stream: Any) -> Iterator[None]:
+    """What compiled code prints on stderr goes to a file."""
+    kept = os.dup(2)
+    os.dup2(stream.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 class Bench:
     """One reader at work: a valid input is made once, and damaged anew for every case."""
 
@@ -112,6 +124,14 @@ class Bench:
 
     def case(self, k: int) -> tuple[str, str, str]:
         """Kind of the outcome, what was done, and what came of it."""
+        with tempfile.TemporaryFile() as stream:
+            with stderr_in(stream):
+                kind, done, found = self._case(k)
+            stream.seek(0)
+            text = stream.read().decode(errors="replace")
+        return ("printed", done, text) if text and kind not in BAD else (kind, done, found)
+
+    def _case(self, k: int) -> tuple[str, str, str]:
         shutil.rmtree(self.bad, ignore_errors=True)
         shutil.copytree(self.good, self.bad, symlinks=True)
         rng = np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), k])

@@ -144,6 +144,22 @@ def test_a_damaged_table_of_chunks_does_not_end_the_process(tmp_path: Path) -> N
         read_cloud(folder / "scan_0.laz")
 
 
+@pytest.mark.parametrize("at", [311, "end"])
+def test_sizes_of_packed_points_are_checked_before_the_decoder_prints_a_panic(
+    at: int | str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = small.cloud_folder(tmp_path / "a", "laz", n=1, spacing=1.0)
+    raw = bytearray((folder / "scan_0.laz").read_bytes())
+    if at == "end":  # the packed table of chunks: the size of one chunk becomes negative
+        raw[-5:] = b"\xff" * 5
+    else:  # sizes of the items of a point
+        raw[at : at + 6] = bytes(6)
+    (tmp_path / "a.laz").write_bytes(raw)
+    with pytest.raises(FormatError, match="LAZ is damaged"):
+        read_cloud(tmp_path / "a.laz")
+    assert capfd.readouterr().err == ""
+
+
 def test_a_las_file_that_claims_a_billion_records_is_refused_at_once(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "las", n=2, spacing=1.0)
     raw = bytearray((folder / "scan_0.las").read_bytes())

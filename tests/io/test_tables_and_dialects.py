@@ -82,6 +82,14 @@ def test_tables_that_lack_something_say_what(tmp_path: Path) -> None:
     assert load_recording(folder, range_sigma=0.7)["landmarks"].sigmas[0, 0] == 0.7
 
 
+def test_a_null_byte_after_the_tag_of_a_line_of_carmen_is_a_bad_line(tmp_path: Path) -> None:
+    path = small.carmen(tmp_path / "robot.log", n=60)
+    path.write_text(path.read_text().replace("ROBOTLASER1 ", "ROBOTLASER1\0 ", 1))
+    log = load_recording(path, reader="carmen")
+    assert log.dropped["laser: number of beams is impossible"] == 1
+    assert len(log["laser"].times) == 59
+
+
 @pytest.mark.parametrize("dialect", ["FLASER", "ROBOTLASER1", "RAWLASER1"])
 def test_dialects_of_carmen_say_the_same(dialect: str, tmp_path: Path) -> None:
     log = load_recording(small.carmen(tmp_path / "robot.log", dialect))
