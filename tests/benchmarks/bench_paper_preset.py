@@ -1,9 +1,10 @@
-"""SegSLAM with the default settings against the equations of the paper (preset ``paper``), on the same random worlds.
+"""SegSLAM and its RBPF with the default settings against the equations of the paper (presets ``paper``), on the same
+random worlds.
 
 ``python -m tests.benchmarks.bench_paper_preset [--worlds N] [--particles N] [--variants NAME ...]``: the small court,
 with other clutter, robot errors and seed in each world. Printed: means over the worlds with 95 % intervals of Student's
 t, and paired differences from the default. Path: RMS position error of a map sample after alignment. NEES: of the ends
-of all segments, a degree of freedom. CPU: of the filter.
+of all segments, a degree of freedom; of ``rbpf`` and ``rbpf-paper``, of the end of the path. CPU: of the filter.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from graphslam.core.config import merge_options
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.random import SeedTree
+from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
@@ -42,6 +45,33 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "moments": {"segslam": {"handover": {"matched_only": True}}},
     "localisation": {"segslam": {"choice": {"method": "localisation"}}},
 }
+RBPF: dict[str, dict[str, Any]] = {
+    "rbpf": {"steps": COURT["steps"], "filter": {**COURT["filter"], "walk_scale": 1.0}},
+    "rbpf-paper": {"steps": COURT["steps"], **preset("paper.rbpf-grid")["frontend"]},
+}
+
+
+def trial_rbpf(log: SensorLog, seed: int, particles: int, options: dict[str, Any]) -> dict[str, float]:
+    """Figures of the RBPF, which makes one submap of the whole log."""
+    front = make_front_end("rbpf-grid", merge_options(options, {"filter": {"particles": particles}}))
+    assert log.truth is not None
+    begin = time.process_time()
+    (submap,) = front.submaps(log, seed=SeedTree(seed))
+    cpu = time.process_time() - begin
+    assert submap.trajectory is not None
+    path = ate(submap.trajectory, log.truth.trajectory, max_diff=0.02).translation
+    return {
+        "path [m]": float(np.sqrt(np.mean(path**2))),
+        "NEES/dof": nees(submap, log.truth.trajectory) / 6,
+        "CPU [s]": cpu,
+    }
+
+
+def nees(submap: Submap, truth: Trajectory) -> float:
+    """NEES of the end of a submap, 6 degrees of freedom."""
+    a, b = remove_roll_pitch(truth.interpolate(np.array(submap.interval)))
+    e = SE3.log(SE3.between(submap.exit_pose, SE3.between(a, b)))
+    return float(e @ np.linalg.solve(submap.exit_covariance, e))
 
 
 def trial(log: SensorLog, seed: int, particles: int, options: dict[str, Any]) -> dict[str, float]:
@@ -54,15 +84,11 @@ def trial(log: SensorLog, seed: int, particles: int, options: dict[str, Any]) ->
     result = front.result(log, seed=SeedTree(seed))
     cpu = time.process_time() - begin
     truth = log.truth.trajectory
-    squares, dof = 0.0, 0
-    for s in submaps_of_best_particle(result, front.config.drift, front.config.segslam):
-        a, b = remove_roll_pitch(truth.interpolate(np.array(s.interval)))
-        e = SE3.log(SE3.between(s.exit_pose, SE3.between(a, b)))
-        squares, dof = squares + float(e @ np.linalg.solve(s.exit_covariance, e)), dof + len(e)
+    ends = [nees(s, truth) / 6 for s in submaps_of_best_particle(result, front.config.drift, front.config.segslam)]
     report = result.report()
     return {
         "path [m]": float(np.sqrt(np.mean(ate(result.trajectory(), truth, max_diff=0.02).translation ** 2))),
-        "NEES/dof": squares / dof,
+        "NEES/dof": float(np.mean(ends)),
         "entries": report["matches"],
         "segments": report["intervals"],
         "CPU [s]": cpu,
@@ -80,7 +106,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=20)
     parser.add_argument("--particles", type=int, default=20)
     parser.add_argument("--first", type=int, default=100, help="seed of the first world")
-    parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
+    parser.add_argument("--variants", nargs="*", default=[*VARIANTS, *RBPF])
     parser.add_argument("--quick", action="store_true", help="two worlds, four particles, two variants")
     a = parser.parse_args()
     if a.quick:
@@ -90,14 +116,16 @@ def main() -> None:
         for seed in range(a.first, a.first + a.worlds):
             log = simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(drift=0.02, max_range=8.0))
             for v in a.variants:
-                rows[v].append(trial(log, seed, a.particles, VARIANTS[v]))
+                run = trial_rbpf if v in RBPF else trial
+                rows[v].append(run(log, seed, a.particles, (VARIANTS | RBPF)[v]))
                 print(f"seed {seed}, {v}:", {k: round(x, 4) for k, x in rows[v][-1].items()}, flush=True)
     for v in a.variants:
         print(v)
         for k in rows[v][0]:
             x = np.array([r[k] for r in rows[v]])
-            first = np.array([r[k] for r in rows[a.variants[0]]])
-            print(f"    {k:9} {interval(x):32} difference {interval(x - first)}")
+            base = "rbpf" if v in RBPF and "rbpf" in rows else a.variants[0]
+            first = np.array([r.get(k, np.nan) for r in rows[base]])
+            print(f"    {k:9} {interval(x):32} difference from {base} {interval(x - first)}")
 
 
 if __name__ == "__main__":

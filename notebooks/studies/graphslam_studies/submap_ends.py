@@ -70,6 +70,7 @@ PAIRS = (
     *(("paper/rule-30", f"paper/rule-30-no-{part}") for part in ("time", "diversity")),
     *(("paper/rule-30-early", f"paper/{s}") for s in ("rule-30", "fixed-30", "fixed-60", "fixed-120")),
     *((f"paper/features-{n}", "paper/features-30") for n in (6, 15, 60)),
+    ("paper/rule-30", "default/own"),
     *(("default/rule-30", f"default/{s}") for s in ("fixed-60", "fixed-240", "rule-15", "rule-60", "own")),
 )
 COMPARED = ("feature_nees", "feature_rms", "pose_nees", "cpu")
