@@ -327,11 +327,8 @@ class FactorGraph(FactorGraphState):
         self, submap: Submap, records: Sequence[FactorRecord], times: Array, T_base_node: Array, *covariances: Array
     ) -> None:
         """Add new nodes after the last one, the submap's entry, and its factors."""
-        node, group, base = (
-            self.structure.count("x") - 1,
-            self.structure.group,
-            self.pose(self.structure.count("x") - 1),
-        )
+        node, group = self.structure.count("x") - 1, self.structure.group
+        base = self.pose(node)
         new = group.compose(np.broadcast_to(base, T_base_node[1:].shape), T_base_node[1:])
         self.structure.append("x", new)
         ids = tuple(r.factor_id for r in records)
@@ -339,18 +336,10 @@ class FactorGraph(FactorGraphState):
         self._place[submap.key] = len(self.submaps)
         self.submaps.append(
             SubmapNode(
-                submap.key,
-                node,
-                submap.interval,
-                submap.trajectory,
-                ids[0],
-                nodes,
-                times,
-                T_base_node,
-                ids,
+                submap.key, node, submap.interval, submap.trajectory, ids[0], nodes, times, T_base_node, ids,
                 *covariances,  # type: ignore[arg-type]
             )
-        )
+        )  # fmt: skip
         for record in records:
             self.insert(record)
 

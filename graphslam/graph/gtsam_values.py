@@ -20,10 +20,29 @@ def value_of(values: Values, name: str, row_of: Mapping[int, int]) -> Array:
     return values[kind.word][row_of[k] if kind.word == "l" else k]
 
 
-def insert_values(out: gtsam.Values, names: Iterable[str], values: Values, row_of: Mapping[int, int]) -> None:
-    """Insert variables of ``values`` into GTSAM's."""
+def insert_values(
+    out: gtsam.Values, names: Iterable[str], values: Values, row_of: Mapping[int, int], frame: Any = None
+) -> None:
+    """Insert variables of ``values`` into GTSAM's; poses and places in another frame if its pose is given."""
     for name in names:
-        out.insert(gtsam_key(name), gtsam_value(value_of(values, name, row_of), name, values.dim))
+        value = gtsam_value(value_of(values, name, row_of), name, values.dim)
+        if frame is not None and (word := split_name(name)[0].word) in PLACED:
+            value = frame.compose(value) if word == "x" else frame.transformFrom(value)
+        out.insert(gtsam_key(name), value)
+
+
+PLACED = ("x", "l", "point")
+"""Kinds with values in the world frame that follow if the frame is changed (:attr:`FactorBatch.relative`)."""
+
+
+def placed(values: Values, T: Array) -> Values:
+    """The same values in another frame, whose pose of the old one is ``T`` ``(3|7,)``; datum and tilt are kept."""
+    out, group = values.copy(), values.group
+    out.poses = group.compose(np.broadcast_to(T, out.poses.shape), out.poses)
+    for word in PLACED[1:]:
+        if out.count(word):
+            out[word] = group.transform(T, out[word])
+    return out
 
 
 def from_gtsam(estimate: gtsam.Values, like: Values, row_of: Mapping[int, int] | None = None) -> Values:

@@ -81,9 +81,9 @@ def cut_submap(submap: Submap, spacing: float | None) -> SubmapChain:
     T = np.concatenate([group.identity[None], inner, submap.exit_pose[None]])
     t0, t1 = submap.interval
     times = np.concatenate([[t0], path.times[rows] if path is not None else [], [t1]])
-    increments = group.between(T[:-1], T[1:])
     if len(rows) == 0 or path is None:
         return SubmapChain(times, T, submap.exit_pose[None].copy(), submap.exit_covariance[None].copy())
+    increments = group.between(T[:-1], T[1:])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(increments[:, : group.dim], axis=1))])
     share = np.diff(along) / along[-1] if along[-1] > 0 else np.full(len(increments), 1.0 / len(increments))
     if path.covariances is None:

@@ -36,10 +36,7 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
     P = check_covariance(cov, what=what, dim=dim)
     L = np.linalg.cholesky(scale * P)
     W, _ = sl.lapack.dtrtri(L, lower=1)
-    W = np.tril(W)
-    with np.errstate(over="ignore"):
-        usable = np.all(np.isfinite(W.T @ W))
-    if not usable:
+    if not np.isfinite(np.vdot(W, W)):
         raise CovarianceError(f"{what} is singular to working precision", got=f"smallest pivot {np.diag(L).min():.3g}")
     return np.asarray(W, dtype=np.float64)
 

@@ -4,6 +4,11 @@ iSAM2 relinearises a variable only if it moved by more than a threshold, so its 
 values. :meth:`Isam2Solver.gap` is the difference of the objective to the batch optimum reached from here,
 :meth:`Isam2Solver.solve_to_optimum` goes there, and only then a :class:`Solution` is flagged converged.
 
+With the datum ``T_gps_world`` as a variable of iSAM2, each GPS fix would change all poses that depend on the datum. So
+iSAM2 has the poses in the GPS frame as soon as the graph has a datum and all factors are relative to it. The first base
+is then free, a fix is a factor on one node, and datum and tilt follow from the first base. It is the same problem in
+other coordinates, with the same optimum.
+
 An update processes only changed records (from the journal of the graph), copies nothing, and the estimate is read
 lazily when the values of the graph are used. GTSAM's ``update`` is not exception-safe: after an exception the object is
 unusable. It is then rebuilt from the records of the graph; a factor is rejected only if that fails, too.
@@ -23,18 +28,25 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.core.se3 import quat_to_matrix
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.factors.batch import FactorRecord, gtsam_factor, pose_array
+from graphslam.graph.factors.attitude import DOWN, AttitudeRecord
+from graphslam.graph.factors.batch import FactorRecord, Fixed, batch_of, gtsam_factor, gtsam_pose, pose_array
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.gtsam_values import from_gtsam, insert_values, value_of
+from graphslam.graph.factors.gps import datum_of, level_datum_pose
+from graphslam.graph.gtsam_values import PLACED, from_gtsam, insert_values, placed, value_of
 from graphslam.graph.variables import Values, gtsam_key, split_name, thresholds
 from graphslam.solve.batch import linearisation_gap, optimise_graph, state_of
 from graphslam.solve.solution import Solution, make_solution
 
 log = logging.getLogger(__name__)
 
+
+LEVEL = 1e-7
+"""Standard deviation of the tilt of a first base that is level by definition [rad]."""
 
 _FAILURES = (RuntimeError, IndexError, ValueError, SolverError)
 """Exceptions of GTSAM, or of the checks of its results."""
@@ -94,6 +106,8 @@ class Isam2Solver:
         self._isam: Any  # gtsam.ISAM2, or None before the first update
         self._held: dict[int, tuple[FactorRecord, int]]  # factor id -> (record, slot)
         self._known: set[str]
+        self._fixed: Fixed  # constants of the factors in iSAM2: the first base, or datum and tilt
+        self._odd: int | None = None  # a factor that is not relative to the datum
         self._read: int  # processed entries of the graph's journal
         self._since_pull = 0
         self._forget()
@@ -156,12 +170,13 @@ class Isam2Solver:
         self._held = {}
         self._known = set()
         self._read = 0
+        self._fixed = {"x0": self.graph.origin}
 
     def _update(self) -> None:
         new, removed = self._difference()
         changed = [i for i in removed if i in self.graph.records]  # re-keyed by a merge
-        lost = self._known - set(self.graph.structure.layout().names()) if removed else set()
-        if changed or lost:
+        lost = self._known - {"x0", *self.graph.structure.layout().names()} if removed else set()
+        if changed or lost or (self._isam is not None and self._in_gps_frame(new) == ("x0" in self._fixed)):
             self._rebuild(new, removed)
         elif new or removed or not self.updates:
             self._check_fresh(new)
@@ -177,7 +192,7 @@ class Isam2Solver:
 
     def _check_fresh(self, new: list[FactorRecord]) -> None:
         """Check that the initial values of new variables are finite."""
-        for name in {n for r in new for n in r.variables()} - self._known - {"x0"}:
+        for name in {n for r in new for n in r.variables()} - self._known - self._fixed.keys():
             if not np.all(np.isfinite(value_of(self.graph.structure, name, self.graph.landmark_rows))):
                 raise SolverError(f"{name} starts at a value that is not finite; iSAM2 is not touched")
 
@@ -192,16 +207,41 @@ class Isam2Solver:
                 new.append(now)
         return new, removed
 
+    def _in_gps_frame(self, new: list[FactorRecord]) -> bool:
+        """Can iSAM2 have the poses in the GPS frame? ``new``: records that it does not have yet."""
+        if self.graph.structure.datum is None or self._odd in self.graph.records:
+            return False
+        start = "x0" in self._fixed
+        if start and not any("datum" in r.variables() for r in new):
+            return False
+        records = self.graph.records.values() if start else new
+        self._odd = next((r.factor_id for r in records if not batch_of(type(r)).relative), None)
+        return self._odd is None
+
+    def _frame(self) -> Any:
+        """``T_gps_world`` in GTSAM's form; None if poses are in the world frame."""
+        if "x0" in self._fixed:
+            return None
+        if "x0" not in self._known:
+            s = self.graph.structure
+            return gtsam_pose(s.datum if self.graph.dim == 2 else level_datum_pose(s.datum, s.tilt))
+        return self._pose("x0").compose(gtsam_pose(self.graph.origin).inverse())
+
     def _feed(self, new: list[FactorRecord], removed: list[int]) -> None:
         """One update of GTSAM."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fresh: dict[str, None] = {}
+        if self._isam is None and self._in_gps_frame(new):
+            self._fixed = {"datum": np.zeros(3)} if self.graph.dim == 2 else {"datum": np.zeros(4), "tilt": np.zeros(2)}
         for record in new:
-            factors.push_back(gtsam_factor(record, self.graph.origin))
+            factors.push_back(gtsam_factor(record, self._fixed))
             for name in record.variables():
-                if name != "x0" and name not in self._known:
+                if name not in self._fixed and name not in self._known:
                     fresh[name] = None
-        insert_values(values, fresh, self.graph.structure, self.graph.landmark_rows)
+        insert_values(values, fresh, self.graph.structure, self.graph.landmark_rows, self._frame())
+        if self._isam is None and "tilt" in self._fixed and self.graph.structure.tilt is None:
+            level = quat_to_matrix(self.graph.origin[3:]).T @ DOWN  # z of the world is up
+            factors.push_back(gtsam_factor(AttitudeRecord(-1, 0, level, np.eye(2) / LEVEL), self._fixed))
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = [self._held[i][1] for i in removed]
         loops = (isinstance(r, BetweenRecord) and fresh.keys().isdisjoint(r.variables()) for r in new)
@@ -217,21 +257,22 @@ class Isam2Solver:
 
     def value(self, name: str) -> Array:
         """The current estimate of one variable in iSAM2."""
-        kind, dim, key = split_name(name)[0], self.graph.dim, gtsam_key(name)
-        group = kind.pose_group(dim)
-        if group is not None:
-            pose = self._isam.calculateEstimatePose2 if dim == 2 else self._isam.calculateEstimatePose3
-            return pose_array(pose(key))
-        return np.array(self._isam.calculateEstimateVector(key))
+        kind, frame = split_name(name)[0], self._frame()
+        if kind.pose_group(self.graph.dim) is not None:
+            pose = self._pose(name)
+            return pose_array(pose if frame is None else frame.between(pose))
+        value = np.array(self._isam.calculateEstimateVector(gtsam_key(name)))
+        return value if frame is None or kind.word not in PLACED else np.array(frame.transformTo(value))
+
+    def _pose(self, name: str) -> Any:
+        """A pose as iSAM2 has it."""
+        read = self._isam.calculateEstimatePose2 if self.graph.dim == 2 else self._isam.calculateEstimatePose3
+        return read(gtsam_key(name))
 
     def _is_finite(self, name: str) -> bool:
         if name[0] != "x":
             return bool(np.all(np.isfinite(self.value(name))))
-        key = gtsam_key(name)
-        if self.graph.dim == 2:
-            pose = self._isam.calculateEstimatePose2(key)
-            return math.isfinite(pose.x() + pose.y() + pose.theta())
-        return math.isfinite(self._isam.calculateEstimatePose3(key).matrix().sum())
+        return math.isfinite(self._pose(name).matrix().sum())
 
     def holds(self, name: str) -> bool:
         """Whether the variable is in iSAM2."""
@@ -243,7 +284,7 @@ class Isam2Solver:
         A residual that is not finite affects all variables of its factor, so it is sufficient to check one per new
         factor: the last, which factors of one update often share.
         """
-        for name in {next((n for n in reversed(r.variables()) if n != "x0"), None) for r in new} - {None}:
+        for name in {next((n for n in reversed(r.variables()) if n not in self._fixed), None) for r in new} - {None}:
             if not self._is_finite(str(name)):
                 raise SolverError("iSAM2 returned values that are not finite")
         self.graph.expect(self)
@@ -254,7 +295,16 @@ class Isam2Solver:
 
     def pull(self, structure: Values) -> Values:
         """All values: from iSAM2 if it has them, otherwise from ``structure``."""
-        estimate = from_gtsam(self._isam.calculateEstimate(), structure, self.graph.landmark_rows)
+        frame = self._frame()
+        T_gps_world = None if frame is None else pose_array(frame)
+        like = structure if T_gps_world is None else placed(structure, T_gps_world)
+        estimate = from_gtsam(self._isam.calculateEstimate(), like, self.graph.landmark_rows)
+        if T_gps_world is not None:
+            estimate = placed(estimate, group_of(T_gps_world).inverse(T_gps_world))
+            estimate.poses[0] = self.graph.origin
+            estimate.datum, tilt = datum_of(T_gps_world)
+            if structure.tilt is not None:
+                estimate.tilt = tilt
         if not estimate.is_finite():
             raise SolverError("iSAM2 returned values that are not finite")
         return estimate

@@ -21,7 +21,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.se3 import quat_rotate, quat_to_matrix, skew, so3_exp, so3_left_jacobian
-from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
+from graphslam.graph.factors.batch import Fixed, UniformBatch, safe_factor, unit_noise
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import gtsam_key
 
@@ -118,6 +118,7 @@ class AttitudeBatch(UniformBatch):
     """Directions of gravity."""
 
     record = AttitudeRecord
+    relative = True
     slots = ("x", "tilt")
 
     def __init__(self, records: Sequence[AttitudeRecord], layout: Any) -> None:
@@ -135,41 +136,37 @@ class AttitudeBatch(UniformBatch):
         return attitude_terms(x, tilt[0], self._direction)
 
     @classmethod
-    def gtsam(cls, record: AttitudeRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: AttitudeRecord, fixed: Fixed) -> gtsam.NonlinearFactor:
         """``W Bᵀ (-Rᵀ u(τ))`` in small matrices: the terms of the batch would take ten times as long for one row."""
         names = record.variables()
-        pose, tilt = node_rotation_position(names[0], origin), gtsam_key("tilt")
-        free = [n for n in names if n != "x0"]
+        rotation, tilt, known = _rotation(names[0], fixed), gtsam_key("tilt"), fixed.get("tilt")
+        free = [n for n in names if n not in fixed]
         WB = record.whitener @ tangent_basis(record.direction).T
         down = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # [e_z]×
 
         def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-            R, _ = pose(values)
-            E, J_r = level_turn(*values.atVector(tilt))
+            R = rotation(values)
+            E, J_r = level_turn(*(values.atVector(tilt) if known is None else known))
             h = -(R.T @ E[:, 2])
             if H is not None:
-                if names[0] != "x0":
+                if names[0] not in fixed:
                     J = np.zeros((2, 6), order="F")
                     J[:, :3] = WB @ skew_of(h)
                     H[0] = J
-                H[-1] = np.asfortranarray(WB @ R.T @ E @ down @ J_r)
+                if known is None:
+                    H[-1] = np.asfortranarray(WB @ R.T @ E @ down @ J_r)
             return np.asarray(WB @ h)
 
-        return safe_factor(unit_noise(record), free, [6, 2][-len(free) :], 2, terms)
+        return safe_factor(unit_noise(record), free, [6 if n[0] == "x" else 2 for n in free], 2, terms)
 
 
-def node_rotation_position(name: str, origin: Array) -> Callable[[gtsam.Values], tuple[Array, Array]]:
-    """Rotation matrix and position of a node; the fixed first base is a constant."""
-    if name == "x0":
-        constant = quat_to_matrix(origin[3:]), origin[:3]
+def _rotation(name: str, fixed: Fixed) -> Callable[[gtsam.Values], Array]:
+    """Rotation matrix of a node, which may be constant."""
+    if name in fixed:
+        constant = quat_to_matrix(fixed[name][3:])
         return lambda _: constant
     key = gtsam_key(name)
-
-    def found(values: gtsam.Values) -> tuple[Array, Array]:
-        x = values.atPose3(key)
-        return x.rotation().matrix(), x.translation()
-
-    return found
+    return lambda values: values.atPose3(key).rotation().matrix()
 
 
 def skew_of(v: Array) -> Array:

@@ -10,7 +10,7 @@ that calls the batch on one row. A record of an unregistered kind is refused at 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self
 
@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of
 from graphslam.core.se3 import matrix_to_quat, quat_normalize
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms
 from graphslam.graph.variables import KINDS, Values, VariableLayout, gtsam_key, split_name
@@ -102,6 +101,8 @@ class FactorBatch(ABC):
     record: ClassVar[type]
     prior: ClassVar[bool] = False
     """A factor of this kind constrains its variables alone, without any other factor."""
+    relative: ClassVar[bool] = False
+    """It depends on poses and places only relative to each other, or to the datum and the vertical."""
     group: str | None = None
     """Class of all factors, if they were made from arrays."""
     arity: Index
@@ -159,8 +160,8 @@ class FactorBatch(ABC):
 
     @classmethod
     @abstractmethod
-    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
-        """GTSAM's factor of a record; one on the fixed first base, at ``origin``, has no key for it."""
+    def gtsam(cls, record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
+        """See :func:`gtsam_factor`."""
 
 
 class UniformBatch(FactorBatch):
@@ -271,9 +272,9 @@ class UniformBatch(FactorBatch):
         return loss
 
     @classmethod
-    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
         """A custom factor that calls :meth:`terms` on one row: slow, but valid for every kind."""
-        return custom_factor(cls, record, origin)
+        return custom_factor(cls, record, fixed)
 
 
 # ------------------------------------------------------------------------------------------------ registry
@@ -302,9 +303,20 @@ def factor_kinds() -> list[type[FactorBatch]]:
     return list(_BATCHES.values())
 
 
-def gtsam_factor(record: Any, origin: Array) -> gtsam.NonlinearFactor:
-    """The GTSAM factor of a record; one on the fixed first base, at ``origin`` ``(3|7,)``, has no key for it."""
-    return batch_of(type(record)).gtsam(record, origin)
+Fixed = Mapping[str, Array]
+"""Variables that are constant, by name."""
+
+
+def gtsam_factor(record: Any, fixed: Array | Fixed) -> gtsam.NonlinearFactor:
+    """The GTSAM factor of a record, without keys for constant variables.
+
+    Parameters
+    ----------
+    fixed : (3,), (7,) or mapping
+        The pose of the fixed first base. Or all constants by name: with datum and tilt at the identity, poses are
+        in the GPS frame and the first base is free.
+    """
+    return batch_of(type(record)).gtsam(record, {"x0": fixed} if isinstance(fixed, np.ndarray) else fixed)
 
 
 # ------------------------------------------------------------------------------------------------ GTSAM
@@ -337,6 +349,11 @@ def read_value(values: gtsam.Values, name: str, key: int, dim: int) -> Array:
     if group is not None:
         return pose_array(values.atPose2(key) if group.dof == 3 else values.atPose3(key))
     return np.array(values.atVector(key))
+
+
+def dim_of(fixed: Fixed) -> int:
+    """2 or 3, from the size of a pose or datum."""
+    return 2 if len(next(iter(fixed.values()))) == 3 else 3
 
 
 def with_kernel(base: Any, robust: RobustKernel) -> Any:
@@ -377,20 +394,20 @@ def safe_factor(noise: Any, names: Sequence[str], widths: Sequence[int], rows: i
     return gtsam.CustomFactor(noise, [gtsam_key(n) for n in names], error)
 
 
-def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsam.CustomFactor:
+def custom_factor(batch: type[UniformBatch], record: Any, fixed: Fixed) -> gtsam.CustomFactor:
     """A custom factor of any kind, from the terms of its batch on one row (the default of every kind)."""
-    dim = group_of(origin).dim
+    dim = dim_of(fixed)
     slots = list(zip(batch.slots, batch.keys(record)))
     one = _alone(batch, record, dim)
     names = [None if k is None else (w if KINDS[w].single else f"{w}{k}") for w, k in slots]
     widths = [KINDS[w].dof(dim) for w, _ in slots]
     first = block_offsets(widths)
-    free = [s for s, n in enumerate(names) if n is not None and n != "x0"]
+    free = [s for s, n in enumerate(names) if n is not None and n not in fixed]
     reads = [(s, names[s], gtsam_key(str(names[s]))) for s in free]
     blocks = [np.zeros((1, KINDS[w].size(dim))) for w in batch.slots]
     for s, n in enumerate(names):
-        if n == "x0":
-            blocks[s][0] = origin
+        if n is not None and n in fixed:
+            blocks[s][0] = fixed[n]
 
     def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
         here = list(blocks)

@@ -12,13 +12,7 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, group_of
-from graphslam.graph.factors.batch import (
-    Index,
-    UniformBatch,
-    gtsam_pose,
-    safe_factor,
-    with_kernel,
-)
+from graphslam.graph.factors.batch import Fixed, Index, UniformBatch, custom_factor, gtsam_pose, with_kernel
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import gtsam_key
 
@@ -70,6 +64,7 @@ class BetweenBatch(UniformBatch):
     """Relative poses."""
 
     record = BetweenRecord
+    relative = True
     slots = ("x", "x")
 
     def __init__(self, records: Sequence[BetweenRecord], layout: Any) -> None:
@@ -135,31 +130,19 @@ class BetweenBatch(UniformBatch):
         return between_terms(self._T, *blocks)
 
     @classmethod
-    def gtsam(cls, record: BetweenRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: BetweenRecord, fixed: Fixed) -> gtsam.NonlinearFactor:
         """GTSAM's own, or a prior if one node is the fixed first base."""
         # Not SqrtInformation(W): GTSAM expects an upper triangular one, and uses only the diagonal of a lower one.
         information = record.whitener.T @ record.whitener
         noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
         group = group_of(record.T_ij)
         plane = group.dim == 2
-        if record.i and record.j:
+        origin = fixed.get("x0")
+        if origin is None or (record.i and record.j):
             ki, kj = gtsam_key(f"x{record.i}"), gtsam_key(f"x{record.j}")
             between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
             return between(ki, kj, gtsam_pose(record.T_ij), noise)
         if record.j:  # from the fixed base: Log(T⁻¹ x_0⁻¹ x_j) is the residual of a prior on x_j
             prior = gtsam.PriorFactorPose2 if plane else gtsam.PriorFactorPose3
             return prior(gtsam_key(f"x{record.j}"), gtsam_pose(group.compose(origin, record.T_ij)), noise)
-        # To the fixed base: Log(T⁻¹ x_i⁻¹ x_0) is not a prior's residual, so the base is a constant of a custom factor.
-        T, x0, key, d = gtsam_pose(record.T_ij), gtsam_pose(origin), gtsam_key(f"x{record.i}"), group.dof
-        Pose = gtsam.Pose2 if plane else gtsam.Pose3
-
-        def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-            H1, H2, H3, H4 = (np.zeros((d, d), order="F") for _ in range(4))
-            x = values.atPose2(key) if plane else values.atPose3(key)
-            h = x.between(x0, H1, H2)
-            r = Pose.Logmap(T.between(h, H3, H4), H2)
-            if H is not None:
-                H[0] = H2 @ H4 @ H1
-            return np.asarray(r)
-
-        return safe_factor(noise, [f"x{record.i}"], [d], d, terms)
+        return custom_factor(cls, record, fixed)  # Log(T⁻¹ x_i⁻¹ x_0) is not the residual of a prior

@@ -142,6 +142,7 @@ class ControlBatch(UniformBatch):
     """Coordinates of places."""
 
     record = ControlRecord
+    relative = True
     slots = ("x", "l", "point", "datum", "tilt")
 
     def __init__(self, records: Sequence[ControlRecord], layout: VariableLayout) -> None:
@@ -186,6 +187,7 @@ class DistanceBatch(UniformBatch):
     """Distances between places."""
 
     record = DistanceRecord
+    relative = True
     slots = ("x", "l", "point", "x", "l", "point")
 
     def __init__(self, records: Sequence[DistanceRecord], layout: VariableLayout) -> None:

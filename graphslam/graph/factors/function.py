@@ -14,8 +14,16 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.poses import group_of
-from graphslam.graph.factors.batch import FactorBatch, Index, read_value, register_factor, safe_factor, unit_noise
+from graphslam.graph.factors.batch import (
+    FactorBatch,
+    Fixed,
+    Index,
+    dim_of,
+    read_value,
+    register_factor,
+    safe_factor,
+    unit_noise,
+)
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms
 from graphslam.graph.variables import KINDS, Values, VariableLayout, gtsam_key, split_name
 
@@ -128,15 +136,15 @@ class FunctionBatch(FactorBatch):
         return loss
 
     @classmethod
-    def gtsam(cls, record: FunctionRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: FunctionRecord, fixed: Fixed) -> gtsam.NonlinearFactor:
         """A custom factor that calls the functions of the user."""
-        dim, names = group_of(origin).dim, record.names
+        dim, names = dim_of(fixed), record.names
         widths = [split_name(n)[0].dof(dim) for n in names]
         first = np.cumsum([0, *widths])
-        free = [s for s, n in enumerate(names) if n != "x0"]
+        free = [s for s, n in enumerate(names) if n not in fixed]
 
         def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-            here = [origin if n == "x0" else read_value(values, n, gtsam_key(n), dim) for n in names]
+            here = [fixed[n] if n in fixed else read_value(values, n, gtsam_key(n), dim) for n in names]
             if H is None:
                 return np.asarray(record.whitener @ record.error(here))
             r, J = record.linearised(here, dim)

@@ -20,7 +20,7 @@ a rotation about the vertical and a translation. If the graph has the tilt of it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,12 +31,10 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import level_poses
 from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, skew, so3_exp
-from graphslam.graph.factors.attitude import level_turn, node_rotation_position, skew_of, up_turn
-from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
+from graphslam.graph.factors.attitude import up_turn
+from graphslam.graph.factors.batch import Fixed, UniformBatch, custom_factor, with_kernel
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, whitener
 from graphslam.graph.variables import Values, gtsam_key
-
-Terms = Callable[[gtsam.Values, "list[Array] | None"], Array]
 
 
 class AntennaRecord:
@@ -252,10 +250,22 @@ def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
     return pose
 
 
+def datum_of(T_gps_world: Array) -> tuple[Array, Array | None]:
+    """Datum and tilt of a ``T_gps_world``: the inverse of :func:`level_datum_pose`."""
+    if len(T_gps_world) == 3:
+        return T_gps_world, None
+    R = quat_to_matrix(T_gps_world[3:])
+    lean = math.hypot(R[2, 0], R[2, 1])
+    tilt = np.array([-R[2, 1], R[2, 0]]) * (math.atan2(lean, R[2, 2]) / lean if lean > 0 else 0.0)
+    R = R @ up_turn(tilt)[0]
+    return np.append(T_gps_world[:3], math.atan2(R[1, 0], R[0, 0])), tilt
+
+
 class GpsBatch(UniformBatch):
     """GPS fixes, 2-D or 3-D."""
 
     record = GpsRecord
+    relative = True
     slots = ("x", "datum", "bias", "tilt", "point")
 
     def __init__(self, records: Sequence[GpsRecord], layout: Any) -> None:
@@ -325,109 +335,27 @@ class GpsBatch(UniformBatch):
         return r, J
 
     @classmethod
-    def gtsam(cls, record: GpsRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """A custom factor in scalar arithmetic: every fix depends on the datum, so this is evaluated most often."""
-        if record.uneven or record.point is not None:
-            return super().gtsam(record, origin)
-        names = record.variables()
-        free = [n for n in names if n != "x0"]
-        terms = _in_the_plane(free, record, origin) if record.rows == 2 else _in_space(names, record, origin)
-        dof = {"x": 3, "d": 3, "b": 2} if record.rows == 2 else {"x": 6, "d": 4, "t": 2, "b": 3}
-        return safe_factor(unit_noise(record), free, [dof[n[0]] for n in free], record.rows, terms)
-
-
-def _in_the_plane(names: list[str], record: GpsRecord, origin: Array) -> Terms:
-    """``W (arm - x⁻¹ T_gps_world⁻¹ (z - bias))`` (see :mod:`graphslam.graph.sensors.gps`) in scalar arithmetic.
-
-    There may be hundreds of fixes, which all depend on the datum, so this is evaluated most often. With numpy arrays of
-    two elements most of the time would be overhead.
-    """
-    ax, ay = map(float, record.arm)
-    zx, zy = map(float, record.z)
-    (w00, w01), (w10, w11) = record.whitener.tolist()
-    ox, oy, ot = map(float, origin)
-    keys = [gtsam_key(n) for n in names]
-    k_pose = keys[0] if record.node else None
-    k_datum = keys[1] if record.node else keys[0]
-    k_bias = keys[-1] if record.bias is not None else None
-    n = len(keys)
-    W = np.array(record.whitener)
-
-    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-        x = values.atPose2(k_pose) if k_pose is not None else None
-        px, py, pt = (ox, oy, ot) if x is None else (x.x(), x.y(), x.theta())
-        d = values.atPose2(k_datum)
-        bx, by = values.atPoint2(k_bias) if k_bias is not None else (0.0, 0.0)
-        cd, sd = math.cos(d.theta()), math.sin(d.theta())
-        ux, uy = zx - bx - d.x(), zy - by - d.y()
-        wx, wy = cd * ux + sd * uy, cd * uy - sd * ux  # fix in the world
-        c, s = math.cos(pt), math.sin(pt)
-        vx, vy = wx - px, wy - py
-        qx, qy = c * vx + s * vy, c * vy - s * vx  # fix in the base frame
-        rx, ry = ax - qx, ay - qy
-        if H is not None:
-            i = 0
-            if k_pose is not None:
-                H[0] = np.array(
-                    [[w00, w01, w01 * qx - w00 * qy], [w10, w11, w11 * qx - w10 * qy]],
-                    order="F",
-                )
-                i = 1
-            Rt = np.array([[c, s, c * -wy + s * wx], [-s, c, s * wy + c * wx]])
-            H[i] = np.asfortranarray(W @ Rt)
-            if k_bias is not None:
-                H[n - 1] = np.asfortranarray(W @ Rt[:, :2] @ np.array([[cd, sd], [-sd, cd]]))
-        return np.array([w00 * rx + w01 * ry, w10 * rx + w11 * ry])
-
-    return terms
-
-
-def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
-    """``W (arm - x⁻¹ Exp(τ) R_z(ψ)ᵀ (z - bias - t))`` in small matrices and scalars."""
-    pose = node_rotation_position(names[0], origin)
-    datum = gtsam_key("datum")
-    bias = None if record.bias is None else gtsam_key(f"bias{record.bias}")
-    tilt = gtsam_key("tilt") if record.tilt else None
-    W, arm, z = np.array(record.whitener), np.array(record.arm), np.array(record.z)
-    W_pose = np.hstack([np.zeros((3, 3)), W])
-
-    def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-        R, t = pose(values)
-        d = values.atVector(datum)
-        u = z - d[:3]
-        if bias is not None:
-            u = u - values.atVector(bias)
-        c, s = math.cos(d[3]), math.sin(d[3])
-        w = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
-        RtE = R.T
-        if tilt is not None:
-            E, J_r = level_turn(*values.atVector(tilt))
-            RtE = RtE @ E
-        q = RtE @ w - R.T @ t
-        if H is not None:
-            WRtE, k = W @ RtE, 0
-            if names[0] != "x0":
-                J = W_pose.copy(order="F")
-                J[:, :3] = -W @ skew_of(q)
-                H[0], k = J, 1
-            Rz_t = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-            J = np.empty((3, 4), order="F")
-            J[:, :3] = WRtE @ Rz_t
-            J[:, 3] = WRtE[:, 1] * w[0] - WRtE[:, 0] * w[1]
-            H[k] = J
-            if bias is not None:
-                H[k + 1] = np.asfortranarray(J[:, :3])
-            if tilt is not None:
-                H[-1] = np.asfortranarray(WRtE @ skew_of(w) @ J_r)
-        return np.asarray(W @ (arm - q))
-
-    return terms
+    def gtsam(cls, record: GpsRecord, fixed: Fixed) -> gtsam.NonlinearFactor:
+        """GTSAM's own in the GPS frame; with a free datum or a bias a custom factor."""
+        plane = record.rows == 2
+        inside = record.point is not None
+        if "datum" not in fixed or record.bias is not None or (plane and record.uneven and not inside):
+            return custom_factor(cls, record, fixed)
+        noise = with_kernel(gtsam.noiseModel.Gaussian.Information(record.whitener.T @ record.whitener), record.robust)
+        if inside:
+            return gtsam.PriorFactorPoint2(gtsam_key(f"point{record.point}"), record.z, noise)
+        key = gtsam_key(f"x{record.node}")
+        if record.uneven:
+            return gtsam.GPSFactorArm(key, record.z, record.arm, noise)
+        known = gtsam.KnownLandmarkFactorPose2 if plane else gtsam.KnownLandmarkFactorPose3
+        return known(key, record.z, record.arm, noise)
 
 
 class BiasPriorBatch(UniformBatch):
     """Priors on the biases of GPS fixes, and links between consecutive biases."""
 
     record = BiasPriorRecord
+    relative = True
     slots = ("bias", "bias")
     prior = True
 
@@ -454,10 +382,10 @@ class BiasPriorBatch(UniformBatch):
         return now - keep * before, np.concatenate([-keep[:, None] * one, one], axis=2)
 
     @classmethod
-    def gtsam(cls, record: BiasPriorRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: BiasPriorRecord, fixed: Fixed) -> gtsam.NonlinearFactor:
         """GTSAM's own prior, if the mean is zero and the covariance isotropic."""
         if record.before is not None or record.shape is not None:
-            return super().gtsam(record, origin)
+            return super().gtsam(record, fixed)
         noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)
         prior = gtsam.PriorFactorPoint2 if record.dim == 2 else gtsam.PriorFactorPoint3
         return prior(gtsam_key(f"bias{record.bias}"), np.zeros(record.dim), noise)

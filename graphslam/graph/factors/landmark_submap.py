@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import FactorBatch, Index, block_offsets, safe_factor
+from graphslam.graph.factors.batch import FactorBatch, Fixed, Index, block_offsets, safe_factor
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 
 CONSTANT = ("wheels", "sensor", "mount")
@@ -152,6 +152,7 @@ class SubmapBatch(FactorBatch):
     """Landmark submaps (Combined SLAM eq. 15), by a compiled kernel."""
 
     record: ClassVar[type] = SubmapRecord
+    relative = True
 
     def __init__(self, records: Sequence[SubmapRecord | PathRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
@@ -214,9 +215,9 @@ class SubmapBatch(FactorBatch):
         return chi2
 
     @classmethod
-    def gtsam(cls, record: SubmapRecord | PathRecord, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: SubmapRecord | PathRecord, constants: Fixed) -> gtsam.NonlinearFactor:
         """A custom factor by the same kernel."""
-        return submap_factor(record, origin)
+        return submap_factor(record, constants)
 
 
 class PathBatch(SubmapBatch):
@@ -240,29 +241,29 @@ def submap_jacobian(
     return whiten_submap(ends, points, every, z, n if places is None else places, chart == "group", np.eye(3 + 2 * n))
 
 
-def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.CustomFactor:
-    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start if that is the fixed first base, at ``origin``.
+def submap_factor(record: SubmapRecord | PathRecord, constants: Fixed) -> gtsam.CustomFactor:
+    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start if that is the fixed first base.
 
     A repeated landmark has one key, whose Jacobian is the sum of its entries.
     """
     entries = record.entries()
     unique = {name: k for k, name in enumerate(dict.fromkeys(entries))}
     entry_of = np.array([unique[name] for name in entries], dtype=np.intp)
-    fixed = record.start == 0
-    names = [] if fixed else [f"x{record.start}"]
+    origin = constants.get(f"x{record.start}")
+    names = [] if origin is not None else [f"x{record.start}"]
     names += [f"x{record.start + 1}", *unique]
     widths = [3 if n[0] == "x" else 2 for n in names]
-    terms = _terms([gtsam_key(n) for n in names], fixed, entry_of, record, origin)
+    terms = _terms([gtsam_key(n) for n in names], entry_of, record, origin)
     return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
 
 
 def _terms(
-    keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array
+    keys: list[int], entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array | None
 ) -> Callable[..., Array]:
     from graphslam.graph.normal_kernels import whiten_submap  # numba takes a third of a second to load
 
     constants = len(CONSTANT) if record.robot >= 0 else 0  # these keys are last
-    first, last = 1 if fixed else 2, len(keys) - constants
+    first, last = 2 if origin is None else 1, len(keys) - constants
     rows, places = entry_of.astype(np.int64), len(entry_of) - constants
     W, z, group = np.ascontiguousarray(record.whitener), record.z, record.chart == "group"
     columns = [6 + 2 * np.flatnonzero(rows == i) for i in range(len(keys) - first)]
@@ -275,10 +276,10 @@ def _terms(
         points = np.empty((len(keys) - first, 2))
         for i, key in enumerate(keys[first:]):
             points[i] = values.atPoint2(key) if first + i < last else values.atVector(key)
-        ends = origin if fixed else pose(values, keys[0]), pose(values, keys[first - 1])
+        ends = pose(values, keys[0]) if origin is None else origin, pose(values, keys[first - 1])
         r, J = whiten_submap(ends, points, rows, z, places, group, W)
         if H is not None:
-            if not fixed:
+            if origin is None:
                 H[0] = J[:, :3]
             H[first - 1] = J[:, 3:6]
             for i, some in enumerate(columns):

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from graphslam.core.geometry import Array, rotation2, wrap_angle
-from graphslam.graph.factors.batch import Index, UniformBatch, custom_factor, with_kernel
+from graphslam.graph.factors.batch import Fixed, Index, UniformBatch, custom_factor, with_kernel
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableLayout, gtsam_key
 
@@ -56,6 +56,7 @@ class ObservationBatch(UniformBatch):
     """Observations: predicted minus measured, bearings wrapped."""
 
     record = ObservationRecord
+    relative = True
     slots = ("x", "l")
 
     def __init__(self, records: Sequence[ObservationRecord], layout: VariableLayout) -> None:
@@ -113,10 +114,10 @@ class ObservationBatch(UniformBatch):
         return r, J
 
     @classmethod
-    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
         """GTSAM's own for bearing and range from a free node; otherwise a custom factor."""
-        if not record.polar or record.node == 0:
-            return custom_factor(cls, record, origin)
+        if not record.polar or f"x{record.node}" in fixed:
+            return custom_factor(cls, record, fixed)
         noise = with_kernel(gtsam.noiseModel.Gaussian.Information(record.whitener.T @ record.whitener), record.robust)
         x, l = (gtsam_key(n) for n in record.variables())
         return gtsam.BearingRangeFactor2D(x, l, gtsam.Rot2(record.z[0]), record.z[1], noise)

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import Index, UniformBatch, custom_factor, register_factor, with_kernel
+from graphslam.graph.factors.batch import Fixed, Index, UniformBatch, custom_factor, register_factor, with_kernel
 from graphslam.graph.factors.range import antennas
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableLayout, gtsam_key
@@ -82,11 +82,11 @@ class PositionBatch(UniformBatch):
         return p - self._z, J
 
     @classmethod
-    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
         """GTSAM's own, unless a direction was not measured or the node is fixed."""
         information = record.whitener.T @ record.whitener
         if record.node == 0 or np.linalg.matrix_rank(information) < len(information):
-            return custom_factor(cls, record, origin)
+            return custom_factor(cls, record, fixed)
         noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
         prior = gtsam.PoseTranslationPrior2D if len(record.z) == 2 else gtsam.PoseTranslationPrior3D
         return prior(gtsam_key(f"x{record.node}"), record.z, noise)

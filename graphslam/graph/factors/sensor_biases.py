@@ -71,6 +71,7 @@ class SensorBiasBatch(UniformBatch):
     """Factors on constant errors."""
 
     record = SensorBiasRecord
+    relative = True
     slots = CONSTANT
     prior = True
 

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.submap import LandmarkMap, turned_covariance
-from graphslam.graph.factors.batch import FactorBatch, block_offsets, pose_array, safe_factor
+from graphslam.graph.factors.batch import FactorBatch, Fixed, block_offsets, pose_array, safe_factor
 from graphslam.graph.noise import whitener
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 from graphslam.linear.space_maps import PlacedMap, SpaceMap
@@ -106,6 +106,7 @@ class SpaceSubmapBatch(FactorBatch):
     """3-D landmark submaps."""
 
     record: ClassVar[type] = SpaceSubmapRecord
+    relative = True
 
     def __init__(self, records: Sequence[SpaceSubmapRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
@@ -142,19 +143,19 @@ class SpaceSubmapBatch(FactorBatch):
         return loss
 
     @classmethod
-    def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
+    def gtsam(cls, record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
         """A custom factor, whitened, with its analytic Jacobian."""
         ids = record.landmark_ids
         marks = list(dict.fromkeys(ids.tolist()))
         entry = np.array([marks.index(i) for i in ids.tolist()], dtype=np.int64)
-        nodes = [k for k in (record.start, record.start + 1) if k != 0]
+        nodes = [k for k in (record.start, record.start + 1) if f"x{k}" not in fixed]
         names = [*(f"x{k}" for k in nodes), *(f"l{i}" for i in marks)]
         keys = [gtsam_key(n) for n in names]
         W = np.linalg.cholesky(record.map.information.toarray()).T
 
         def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
             free = [pose_array(values.atPose3(k)) for k in keys[: len(nodes)]]
-            poses = np.stack([origin, *free] if len(nodes) < 2 else free)
+            poses = np.stack([fixed["x0"], *free] if len(nodes) < 2 else free)
             points = np.array([values.atPoint3(k) for k in keys[len(nodes) :]]).reshape(-1, 3)[entry]
             u, J = record.terms(poses, points)
             if H is not None:

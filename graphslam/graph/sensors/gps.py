@@ -5,6 +5,7 @@ The factor itself is in :mod:`graphslam.graph.factors.gps`.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -291,8 +292,8 @@ class GpsFactors(SensorFactors):
         """Attach waiting fixes to a submap, with ``closed`` also one at its end; with ``more`` no datum is started."""
         g = self.graph
         dropped = self._queue(s, closed)
-        late = [f for f in self.waiting if f.time < s.interval[0] and not more and s is g.submaps[-1]]
-        self.waiting = [f for f in self.waiting if f not in late]
+        late = self.waiting[: 0 if more or s is not g.submaps[-1] else self._before(s.interval[0])]
+        self.waiting = self.waiting[len(late) :]
         self._drop([*dropped, *((f.factor_id, "no submap covers it") for f in late)])
         if more or not self.attached:
             return
@@ -357,14 +358,15 @@ class GpsFactors(SensorFactors):
             self.graph.ledger.release(fid)
             self.graph.log_event("gps-dropped", factor_id=fid, reason=reason)
 
+    def _before(self, t: float, at: bool = False) -> int:
+        """Number of waiting fixes before a time; ``at``: or at it."""
+        return (bisect_right if at else bisect_left)(self.waiting, t, key=lambda f: f.time)
+
     def _queue(self, s: SubmapNode, closed: bool) -> list[tuple[int, str]]:
         """Attach the fixes of one submap to its nodes; returns (factor_id, reason) of fixes that cannot be used."""
-        t0, t1 = s.interval
-        times = np.array([f.time for f in self.waiting])
-        inside = (times >= t0) & ((times <= t1) if closed else (times < t1))
-        mine = [f for f, m in zip(self.waiting, inside) if m]
-        self.waiting = [f for f, m in zip(self.waiting, inside) if not m]
-        dropped = []
+        first, end = self._before(s.interval[0]), self._before(s.interval[1], closed)
+        mine, dropped = self.waiting[first:end], []
+        del self.waiting[first:end]
         if mine and s.trajectory is None:
             return [(f.factor_id, "submap has no trajectory") for f in mine]
         for f in mine:
