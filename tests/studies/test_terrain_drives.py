@@ -11,7 +11,15 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam_studies.montecarlo.study import open_study
-from graphslam_studies.terrain_drives import STUDY, DriveTrialConfig, draw_course, harm_of, run_drive_trial
+from graphslam_studies.terrain_drives import (
+    FORGETTING,
+    STUDY,
+    DriveTrialConfig,
+    draw_course,
+    harm_of,
+    run_drive_trial,
+    struck,
+)
 from graphslam_studies.terrain_learning import FIRST_SEED
 
 CURB = DriveTrialConfig(maps=("bands",), targets=("curb-15",), begin=4.0, beyond=2.5, longest=30.0)
@@ -54,3 +62,23 @@ def test_harm_is_what_the_vehicle_touches_first() -> None:
 
 def test_drives_have_seeds_of_their_own() -> None:
     assert STUDY.default_trials(False) < FIRST_SEED
+
+
+def test_a_person_is_struck_only_while_the_robot_moves() -> None:
+    config = replace(CURB, movers=1, pace=(1.0, 1.0))
+    course = draw_course(3, config)
+    [person] = course.movers
+    time = next(t for t in np.arange(0.0, 60.0, 0.1) if abs(person.state(np.array([t]))[0][0, 1]) < 0.05)
+    x = person.start[0] + np.linspace(-0.5, 0.0, 50)  # 1 m/s, ends where the person is after half a second
+    drives = np.column_stack([x, np.zeros(50)])
+    v = config.trial.vehicle
+    assert struck(drives, time - 0.5, course.movers, v)
+    assert not struck(drives[-1:].repeat(50, axis=0), time - 0.5, course.movers, v)
+    assert not struck(drives - [3.0, 0.0], time - 0.5, course.movers, v)
+
+
+def test_a_map_that_forgets_shows_less_of_who_left() -> None:
+    config = DriveTrialConfig(maps=FORGETTING, targets=("nothing",), movers=2)
+    found = {(m.algorithm, m.quantity): m.value for m in run_drive_trial(config, 300)}
+    assert found["bands", "ghost"] > 0.3
+    assert found["bands, forgets", "ghost"] < 0.5 * found["bands", "ghost"]

@@ -1,10 +1,11 @@
 """The study ``terrain-drives``: closed-loop drives. A robot plans a path on its own map, drives, and plans again.
 
-Every trial has a random street with one target and drives through it with each of five maps and the same random errors.
+Every trial has a random street with one target and drives through it with each of six maps and the same random errors.
 In half of the streets, a target across the full width has a passage. Maps:
 
 * ``bands``: one map per range band; speed limited by the detection range of falls and by the known free path ahead;
 * ``bands, no bound``: the same map, always 1 m/s;
+* ``bands, forgets``: as ``bands``, but cells that two successive sweeps saw free keep these two sweeps only;
 * ``one grid, learnt``: one grid of 0.2 m with the same learnt weights, all ranges added, with both speed limits;
 * ``one grid, OctoMap``: one grid of 0.2 m, log-odds +0.85 for a hit and −0.4 for a miss, with both limits;
 * ``one grid, equal``: the same with ±0.4.
@@ -13,13 +14,18 @@ The robot adds the lines measured so far and plans the cheapest path to a line 6
 time; a command takes effect one reaction time later. A drive ends at the goal, at the first harm, after standing still
 for 7 s, or after 90 s.
 
+In the worlds ``people`` (0.6 to 1.6 m/s) and ``fast`` (2 to 4 m/s) two persons cross the street to and fro. They do not
+avoid the robot.
+
 Quantities
 ----------
 ``fall``, ``curb``, ``crash``, ``steep``: 1 if a circle as wide as the vehicle touched a fall, a step up, an obstacle,
-or ground that is too steep. ``arrived``; ``way``: 1 if a path exists on the true map; ``right``: 1 if it arrived and a
-path exists, or did not arrive, without harm, and none exists. ``coverage``: known share of the free lane 0.8–8 m ahead,
-within ±60°, mean over plans. ``speed``: mean while there was a plan [m/s]. ``detour``: if arrived, length driven over
-the length of the best path on the true map; ``cost``: ratio of the costs of these paths on that map.
+or ground that is too steep; ``struck``: 1 if it touched a person while the robot moved. ``ghost``: share of hazards
+among the free cells in view that a person covered and left at least three sweeps ago, ``beside``: among the others,
+means over the same plans. ``arrived``; ``way``: 1 if a path exists on the true map; ``right``: 1 if it arrived and a
+path exists, or did not arrive, without harm, and none exists. ``coverage``: known share of the free lane 0.8–8 m
+ahead, within ±60°, mean over plans. ``speed``: mean while there was a plan [m/s]. ``detour``: if arrived, length
+driven over the length of the best path on the true map; ``cost``: ratio of the costs of these paths on that map.
 """
 
 from __future__ import annotations
@@ -37,14 +43,16 @@ from scipy.ndimage import binary_closing, distance_transform_edt
 
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.maps.terrain.lines import ScanLines, lines_of_scans
+from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT
+from graphslam.maps.terrain.lines import Rows, ScanLines, lines_of_scans
 from graphslam.maps.terrain.plan import CostConfig, CostMap, cost_map
-from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass, TerrainMap
-from graphslam.maps.terrain.tables import read_tables
+from graphslam.maps.terrain.pyramid import HAZARDS, Pyramid, TerrainClass, TerrainMap
+from graphslam.maps.terrain.tables import SCALE, noisy_or, read_tables
 from graphslam.maps.terrain.vehicle import CELLS, Vehicle
 from graphslam_studies.maps.plan import PlannedPath, plan_vehicle_path
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy
+from graphslam_studies.sim.movers import Mover, clear_of, person
 from graphslam_studies.sim.street import (
     BEGIN,
     END,
@@ -71,9 +79,11 @@ from graphslam_studies.terrain_trial import (
 
 FIXED = {"one grid, OctoMap": (0.85, 0.4), "one grid, equal": (0.4, 0.4)}
 """Maps with fixed weights: log-odds of a hit and of a miss."""
+FORGETTING = ("bands", "bands, forgets")
+"""Maps of the worlds in which something moves."""
 CLOSING = 2
 """Number of bands whose hazards block paths: those with cells narrower than half the vehicle."""
-HARMS = ("fall", "curb", "crash", "steep")
+HARMS = ("fall", "curb", "crash", "steep", "struck")
 PATIENCE = 7.0
 """A drive ends after standing still for this time: three sweeps and one plan [s]."""
 
@@ -82,7 +92,7 @@ PATIENCE = 7.0
 class DriveTrialConfig:
     """Settings of the drives."""
 
-    maps: tuple[str, ...] = ("bands", "bands, no bound", "one grid, learnt", *FIXED)
+    maps: tuple[str, ...] = ("bands", "bands, no bound", "bands, forgets", "one grid, learnt", *FIXED)
     targets: tuple[str, ...] = tuple(TARGETS)
     fastest: float = 1.0
     """[m/s]"""
@@ -94,6 +104,10 @@ class DriveTrialConfig:
     """Safety margin on either side of the vehicle when planning, for errors of pose and cells [m]."""
     longest: float = 90.0
     """[s]"""
+    movers: int = 0
+    """Number of people who cross the street."""
+    pace: tuple[float, float] = (0.6, 1.6)
+    """Their lowest and highest speed [m/s]."""
     trial: TerrainTrialConfig = field(default_factory=TerrainTrialConfig)
 
 
@@ -113,6 +127,7 @@ class Course:
     """Costs of the true map."""
     free_lane: Mask
     """Free cells of 0.1 m in the lane."""
+    movers: tuple[Mover, ...] = ()
 
 
 def draw_course(seed: int, config: DriveTrialConfig) -> Course:
@@ -138,7 +153,19 @@ def draw_course(seed: int, config: DriveTrialConfig) -> Course:
     start = np.array([street.target_at - c.begin, 0.0])
     best = _plan(costs, start, street.target_at + c.beyond)
     lane = (truth.labels == 0) & (np.abs(truth.y) < 1.7)[:, None]
-    return Course(street, start, street.target_at + c.beyond, away, best, costs, lane)
+    return Course(street, start, street.target_at + c.beyond, away, best, costs, lane, draw_people(street, c, seed))
+
+
+def draw_people(street: Street, c: DriveTrialConfig, seed: int) -> tuple[Mover, ...]:
+    """People who cross the street between start and goal, from behind one wall to behind the other."""
+    rng, out = SeedTree(int(seed)).child("people").generator(), []
+    for _ in range(c.movers):
+        x, far = street.target_at + float(rng.uniform(2.0 - c.begin, c.beyond - 1.0)), HALF_WIDTH + 3.0
+        leg, speed = np.array([[x, -far], [x, far]]), float(rng.uniform(*c.pace))
+        where, floor = float(rng.uniform(0.0, 4.0 * far)), float(street.height(x, 0.0))
+        boxes = person(rng)
+        out.append(Mover(kind="person", start=leg[0], end=leg[1], floor=floor, speed=speed, phase=where, boxes=boxes))
+    return tuple(out)
 
 
 def _closes(street: Street, v: Vehicle) -> bool:
@@ -161,6 +188,57 @@ def _plain_map(origin: Array, cell: float, classes: npt.NDArray[np.int8]) -> Ter
     return TerrainMap(origin, cell, p, classes, nothing, nothing, np.where(known, 0, -1).astype(np.int8), nowhere)
 
 
+class Sweeps:
+    """The last sweeps of the laser apart, so that a map can forget what left.
+
+    Parameters
+    ----------
+    pyramid : Pyramid
+        The map; a cell that two successive sweeps saw free keeps the evidence of these two only.
+    lines : int
+        Number of lines of a sweep.
+    """
+
+    def __init__(self, pyramid: Pyramid, lines: int) -> None:
+        self.pyramid, self.lines, self.count = pyramid, lines, 0
+        self.last, self.current = (pyramid_like(pyramid) for _ in range(2))
+
+    def add(self, rows: Rows, lines: int) -> None:
+        """Detections of some more lines, which the map has already."""
+        self.current.add(rows)
+        self.count += lines
+        if self.count >= self.lines:
+            free = self._free(self.last) & self._free(self.current)
+            for name in ("ratios", "counts", "heights"):
+                last, current = getattr(self.last, name), getattr(self.current, name)
+                getattr(self.pyramid, name)[:, free] = last[:, free] + current[:, free]
+            self.last, self.current, self.count = self.current, pyramid_like(self.pyramid), 0
+
+    @staticmethod
+    def _free(sweep: Pyramid) -> Mask:
+        """Flat cells in which a sweep saw ground and no hazard, in their band or in most of their finer cells."""
+        out = np.zeros(sweep.counts.shape[1], np.bool_)
+        finer: tuple[Mask, Mask] = (out, out)
+        for b in range(sweep.bands):
+            counts, ratios = sweep.band_of(sweep.counts, b), sweep.band_of(sweep.ratios, b) / SCALE
+            seen = counts[SUPPORT] > 0
+            hazard = seen & (noisy_or(ratios, counts[: OVERHANG + 1], sweep.weights_of(b)) > sweep.tables.threshold)
+            hazard |= counts[OVERHANG] > 0
+            if b:
+                k = round(float(sweep.cells[b] / sweep.cells[b - 1]))
+                ny, nx = seen.shape
+                seen = seen | (finer[0].reshape(ny, k, nx, k).mean(axis=(1, 3)) > 0.5)
+                hazard = hazard | finer[1].reshape(ny, k, nx, k).any(axis=(1, 3))
+            sweep.band_of(out, b)[:] = seen & ~hazard
+            finer = seen, hazard
+        return out
+
+
+def pyramid_like(p: Pyramid) -> Pyramid:
+    """An empty map with the box and the bands of another one."""
+    return Pyramid(BOX, p.tables, p.vehicle, p.sensor, tuple(p.cells))
+
+
 class Navigator:
     """One of the compared maps, and path planning on it.
 
@@ -177,6 +255,7 @@ class Navigator:
         cells = CELLS if name.startswith("bands") else SINGLE
         self.config, self.bound = config, "no bound" not in name
         self.pyramid = Pyramid(BOX, tables, c.vehicle, c.sensor, cells)
+        self.sweeps = Sweeps(self.pyramid, round(c.robot.sweep * c.robot.line_rate)) if "forgets" in name else None
         self.weights = FIXED.get(name)
         self.fixed = FixedGrid(self.pyramid)
         self.vehicle: Vehicle = replace(c.vehicle, width=c.vehicle.width + 2.0 * config.spare)
@@ -189,6 +268,8 @@ class Navigator:
         rows = statements(lines, self.pyramid)
         if self.weights is None:
             self.pyramid.add(rows)
+            if self.sweeps is not None:
+                self.sweeps.add(rows, len(lines))
         else:
             self.fixed.add(rows)
 
@@ -262,12 +343,16 @@ def run_drive_trial(config: DriveTrialConfig, seed: int) -> Iterator[Measurement
 def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterator[Measurement]:
     v = c.trial.vehicle
     tick = v.reaction_time
-    rover = StreetRover(course.street, seed, c.trial.robot, acceleration=v.deceleration, longest=c.longest + 5.0)
+    rover = StreetRover(
+        course.street, seed, c.trial.robot, acceleration=v.deceleration, longest=c.longest + 5.0, movers=course.movers
+    )
     navigator = Navigator(name, c, course.start)
     state = RoverState(place=course.start)
     command = Command(np.vstack([course.start, course.start + [0.1, 0.0]]), 0.0)
     harm, stood, driven = "", 0.0, [course.start[None]]
     covered: list[float] = []
+    ghosts: list[tuple[float, float]] = []
+    people = np.full(course.free_lane.shape, -np.inf)
     speeds: list[float] = []
     spent, plans = 0.0, 0
     while state.time < c.longest and not harm and state.place[0] < course.goal - 0.5 and stood < PATIENCE:
@@ -276,13 +361,20 @@ def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterato
             begin = process_time()
             planned = navigator.plan(rover.after(state, command, tick).place, course.goal)
             spent, plans = spent + process_time() - begin, plans + 1
-            covered.append(_coverage(navigator.found, course, state.place))
+            found, view = navigator.found, _in_view(course, state.place)
+            assert found is not None
+            covered.append(_share(found.known, found, view))
+            left = view & np.isfinite(people) & (people < state.time - 3.0 * c.trial.robot.sweep)
+            hazard = np.isin(found.classes, HAZARDS)
+            if left.any():
+                ghosts.append((_share(hazard, found, left), _share(hazard, found, view & ~np.isfinite(people))))
         # the new command takes effect one reaction time later; until then the old one is driven
-        there = state.place
+        there, at = state.place, state.time
         state, scans, believed, places = rover.drive(state, command, tick)
+        _mark_people(people, course.movers, at, state.time)
         navigator.read(lines_of_scans(scans, believed, c.trial.robot.height))
         driven.append(places)
-        harm = harm_of(places, course, v)
+        harm = harm_of(places, course, v) or ("struck" if struck(places, at, course.movers, v) else "")
         stood = stood + tick if float(np.linalg.norm(state.place - there)) < 0.02 else 0.0
         if planned is None:
             command = Command(command.path, 0.0)
@@ -300,11 +392,14 @@ def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterato
         yield Measurement(name, "coverage", float(np.mean(covered)))
     if speeds:
         yield Measurement(name, "speed", float(np.mean(speeds)))
+    if ghosts:
+        yield Measurement(name, "ghost", float(np.mean(ghosts, axis=0)[0]))
+        yield Measurement(name, "beside", float(np.mean(ghosts, axis=0)[1]))
     if arrived and course.best is not None:
         track = track[::25]  # subsampled, so that white pose errors do not add to the length
         steps = np.linalg.norm(np.diff(track, axis=0), axis=1)
-        at = np.floor((track[1:] - course.costs.origin) / course.costs.cell).astype(np.int64)
-        cost = course.costs.cost[at[:, 1], at[:, 0]]
+        cells = np.floor((track[1:] - course.costs.origin) / course.costs.cell).astype(np.int64)
+        cost = course.costs.cost[cells[:, 1], cells[:, 0]]
         worst = float(cost[np.isfinite(cost)].max())  # used where pose errors lead into the safety margin
         yield Measurement(name, "detour", float(steps.sum()) / course.best.length)
         yield Measurement(name, "cost", float(steps @ np.where(np.isfinite(cost), cost, worst)) / course.best.cost)
@@ -320,16 +415,39 @@ def harm_of(places: Array, course: Course, v: Vehicle) -> str:
     return min(hit, key=lambda k: hit[k]) if hit else ""
 
 
-def _coverage(found: TerrainMap | None, course: Course, place: Array) -> float:
-    """Share of the free lane ahead that is known."""
-    assert found is not None
-    k = round(found.cell / CELLS[0])
-    known = found.known.repeat(k, axis=0).repeat(k, axis=1)
-    ny, nx = known.shape
+def struck(places: Array, begin: float, movers: tuple[Mover, ...], v: Vehicle) -> bool:
+    """Whether the circle of the vehicle touched somebody while it was moving; places ``(n, 2)`` every 0.01 s."""
+    moves = np.flatnonzero(np.linalg.norm(np.gradient(places, 0.01, axis=0), axis=1) > 0.05)
+    if not len(moves):
+        return False
+    times = begin + 0.01 * np.asarray(moves, np.float64)
+    x, y = places[moves].T
+    return any(not clear_of(m, times, np.column_stack([x, y, x * 0 + m.floor]), 0.5 * v.width) for m in movers)
+
+
+def _mark_people(covered: Array, movers: tuple[Mover, ...], begin: float, end: float) -> None:
+    """Write the last time at which somebody covered each cell of 0.1 m into ``covered``."""
+    for t in np.arange(begin, end, 0.05):
+        for mover in movers:
+            at, radius = mover.state(np.array([t]))[0][0] - np.array(BOX[:2]), mover.radius
+            low = np.maximum(np.floor((at - radius) / CELLS[0]).astype(np.int64), 0)
+            high = np.maximum(np.ceil((at + radius) / CELLS[0]).astype(np.int64), 0)
+            covered[low[1] : high[1], low[0] : high[0]] = t
+
+
+def _in_view(course: Course, place: Array) -> Mask:
+    """Free cells of the lane ahead, 0.8 to 8 m away and within ±60°."""
+    ny, nx = course.free_lane.shape
     x, y = (BOX[a] + CELLS[0] * (np.arange(n) + 0.5) - place[a] for a, n in ((0, nx), (1, ny)))
     r, bearing = np.hypot(x[None], y[:, None]), np.arctan2(np.abs(y)[:, None], x[None])
-    ahead = course.free_lane & (r > 0.8) & (r < 8.0) & (bearing < np.deg2rad(60.0))
-    return float((known & ahead).sum() / max(ahead.sum(), 1))
+    return np.asarray(course.free_lane & (r > 0.8) & (r < 8.0) & (bearing < np.deg2rad(60.0)))
+
+
+def _share(cells: Mask, found: TerrainMap, among: Mask) -> float:
+    """Share of some cells of a map among cells of 0.1 m."""
+    k = round(found.cell / CELLS[0])
+    ny, nx = among.shape
+    return float((cells.repeat(k, axis=0).repeat(k, axis=1)[:ny, :nx] & among).sum() / max(among.sum(), 1))
 
 
 class DrivesStudy(WorldsStudy[DriveTrialConfig]):
@@ -347,7 +465,7 @@ class DrivesStudy(WorldsStudy[DriveTrialConfig]):
             index=["world", "algorithm"], columns="quantity", values="value", aggfunc="sum", sort=False
         )
         out["drives in closed loop: how they ended"] = sums.astype(int).assign(drives=drives).reset_index()
-        means = [q for q in ("coverage", "speed", "detour", "cost") if q in wide]
+        means = [q for q in ("coverage", "speed", "detour", "cost", "ghost", "beside") if q in wide]
         out["means over drives"] = wide[means].reset_index()
         c = next(iter(self.full.values()))
         v, s = c.trial.vehicle, c.trial.sensor
@@ -375,7 +493,11 @@ class DrivesStudy(WorldsStudy[DriveTrialConfig]):
 STUDY = DrivesStudy(
     "terrain-drives",
     "Drives in closed loop through streets with obstacles, edges and holes, on the map that is made on the way.",
-    {"streets": DriveTrialConfig()},
+    {
+        "streets": DriveTrialConfig(),
+        "people": DriveTrialConfig(maps=FORGETTING, movers=2),
+        "fast": DriveTrialConfig(maps=FORGETTING, movers=2, pace=(2.0, 4.0)),
+    },
     {"quick": DriveTrialConfig(maps=("bands",), targets=("hole-1.0",), begin=4.0, beyond=2.5, longest=25.0)},
     trials=100,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.sim.crawler_sensors import cast_scans
 from graphslam.sim.raycast import RayCaster
+from graphslam_studies.sim.movers import Mover, MovingObjects
 from graphslam_studies.sim.street import Street, StreetRobot, pose_errors
 
 _DT = 0.01
@@ -57,6 +59,8 @@ class StreetRover:
         Of speeding up and of braking [m/s²].
     longest : float
         Time that it may drive [s].
+    movers : sequence of Mover
+        What moves in the street, seen by the laser.
 
     Raises
     ------
@@ -72,10 +76,11 @@ class StreetRover:
         *,
         acceleration: float = 0.5,
         longest: float = 120.0,
+        movers: Sequence[Mover] = (),
     ) -> None:
         if not (acceleration > 0 and longest > 1):
             raise ConfigError(f"rover: acceleration {acceleration}, longest {longest}; wanted > 0, > 1")
-        self.street, self.acceleration, self.longest = street, acceleration, longest
+        self.street, self.acceleration, self.longest, self.movers = street, acceleration, longest, movers
         self.robot = robot = robot or StreetRobot()
         self._tree = SeedTree(int(seed)).child("street rover")
         self._errors = pose_errors(round(longest / _DT) + 200, _DT, robot.pose_scale, self._tree.child("pose"))
@@ -115,7 +120,9 @@ class StreetRover:
         lines = np.arange(math.ceil(first * _DT * rate - 1e-9), math.ceil((first + steps) * _DT * rate - 1e-9))
         truth = _Path(Trajectory(times, poses))
         seeds = self._tree.child("beams", str(first))
-        scans = cast_scans(self.robot.scans(lines / rate), truth, self._caster, self.robot.noise(), seeds)
+        wanted = self.robot.scans(lines / rate)
+        nearer = MovingObjects(self.movers, wanted.ranges.shape, self.robot.max_range) if self.movers else None
+        scans = cast_scans(wanted, truth, self._caster, self.robot.noise(), seeds, nearer=nearer)
         return new, scans, believed, np.column_stack([x, y])[:steps]
 
     def _follow(self, state: RoverState, command: Command, steps: int, *, beyond: int) -> tuple[RoverState, Array]:
