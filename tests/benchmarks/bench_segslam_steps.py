@@ -1,7 +1,8 @@
 """Work of online SegSLAM for each step, over the mine: longest step, median, and growth with the map.
 
 ``python -m tests.benchmarks.bench_segslam_steps [--particles N] [--seconds S] [--world mine]``: CPU time of the steps
-of the filter (0.4 s of driving) and of their slices, the work between two records; by quarters of the path. The mine
+of the filter (0.4 s of driving) and of their slices, the work between two records; by quarters of the path;
+memory of all maps along it. The mine
 needs `graphslam-studies`.
 """
 
@@ -51,12 +52,17 @@ def main() -> None:
     front = RunOptions.for_log(log, "segslam", "isam2", a.seed, {"frontend": asked}).front
     assert isinstance(front, SegSlam)
     begin, steps, slices = time.process_time(), list[float](), list[float]()
+    maps = [(0, 0.0)]
     for _ in front.follow(RecordSource(log), seed=SeedTree(a.seed)):
         run = front._live[0].run
         steps, slices = run.step_seconds, run.slice_seconds
+        maps.append((len(steps), run.filter.pool.used_bytes / 1e6))
     print(f"{log.name}, {log.duration:.0f} s, {a.particles} particles: {time.process_time() - begin:.1f} CPU seconds")
     table("steps", np.array(steps))
     table("slices", np.array(slices))
+    at = np.linspace(0.0, len(steps), 9)[1:]
+    megabytes = np.interp(at, *np.array(maps).T)
+    print("maps at the ends of the eighths [MB]:", *(f"{m:.1f}" for m in megabytes))
 
 
 if __name__ == "__main__":
