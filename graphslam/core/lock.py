@@ -79,14 +79,14 @@ def _take(home: Path) -> Any:
         raise RunFolderError(f"{home}: process {owner} is writing into it; wait until it has ended") from None
     except OSError:  # a file system without locks
         pass
-    handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")  # the file stays non-empty: is_empty() reads it
+    handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")
     handle.truncate()
     handle.flush()
     return handle
 
 
 def is_lock(file: Path) -> bool:
-    """Is it a lock file of :func:`lock_folder`?"""
+    """Is it a lock file of :func:`lock_folder`, perhaps one that was not written because of a full disk or a kill?"""
     with contextlib.suppress(OSError), open(os.open(file, os.O_RDONLY | _NO_WAIT), "rb") as stream:
-        return stream.read(len(_HEAD)) == _HEAD.encode()
+        return file.is_file() and _HEAD.encode().startswith(stream.read(len(_HEAD)))
     return False

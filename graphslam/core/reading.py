@@ -193,7 +193,7 @@ def integer_mask(values: npt.ArrayLike) -> Any:
 
 def safe_name(name: str, where: str) -> str:
     """Return the name if it is a plain file name without a path."""
-    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,200}", name):
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.+-]{0,200}", name):
         raise FormatError("file name leads out of its folder", where=where, got=repr(name[:80]), wanted="a file name")
     return name
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphslam.app.folders.generations import is_empty
 from graphslam.core import output_folder as outputs
 from graphslam.core.atomic import atomic_open, check_file_target, part_path, read_npz, write_npz
 from graphslam.core.errors import FormatError, OutputError, RunFolderError
@@ -116,6 +117,17 @@ def test_a_failure_leaves_the_old_output_or_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "fresh").exists()
 
 
+@pytest.mark.parametrize(("text", "accepted"), [("", True), ("graphslam: this fol", True), ("mine", False)])
+def test_a_lock_that_a_full_disk_cut_off_is_no_file_of_another(text: str, accepted: bool, tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text(text)
+    assert is_empty(tmp_path) is accepted
+    if accepted:
+        assert seen(made(tmp_path, "index")) == {"index": "new"}
+    else:
+        with pytest.raises(OutputError, match="such as a lock"):
+            made(tmp_path, "index")
+
+
 def test_a_folder_that_another_process_has_just_made_is_left_to_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,12 +193,12 @@ def test_a_list_of_files_from_somebody_else_deletes_nothing_outside(name: str, t
 
 
 def test_tiles_of_an_earlier_map_go_and_clouds_of_the_user_stay(tmp_path: Path) -> None:
-    points = np.array([[1.0, 1.0, 0.0], [50.0, 1.0, 0.0]])
+    points = np.array([[-1.0, -1.0, 0.0], [50.0, 1.0, 0.0]])
     root = write_autoware(tmp_path / "map", points, datum=(35.0, 139.0))
     (root / "pointcloud_map.pcd" / "mine.pcd").write_text("mine")
     (root / "lanelet2_map.osm").write_text("mine")
     write_autoware(root, points[:1])
-    assert sorted(p.name for p in (root / "pointcloud_map.pcd").iterdir()) == ["0_0.pcd", "mine.pcd"]
+    assert sorted(p.name for p in (root / "pointcloud_map.pcd").iterdir()) == ["-20_-20.pcd", "mine.pcd"]
     assert (root / "lanelet2_map.osm").read_text() == "mine"
     assert (root / "map_projector_info.yaml").read_text() == "projector_type: Local\n"
 

@@ -138,7 +138,7 @@ DENSE = {
         lambda work: ["loops", str(work / "out"), "--undo", loop_of(work)],
         tuple(f"out/{p}" for p in outputs.SAME_BYTES),
     ),
-    "export nav2": Verb(_path("export", "@out", "--format", "nav2", "--out", "@out2"), ("out2/*",), "folder"),
+    "export nav2": Verb(_path("export", "@out", "--format", "nav2", "--out", "@out2"), ("out2/map*",), "folder"),
     "export autoware": Verb(
         _path("export", "@out", "--format", "autoware", *DATUM, "--heading", "90", "--out", "@out2"),
         ("out2/*.yaml", "out2/*/*.pcd"),

@@ -251,7 +251,7 @@ def is_empty(folder: str | os.PathLike[str]) -> bool:
     ours = is_lock(home / LOCK)
     for path in home.iterdir():
         if path.name == LOCK:
-            if not ours and path.stat().st_size > 0:  # an empty lock file was created but not yet written
+            if not ours:
                 return False
         elif path.name == GENERATIONS and ours and path.is_dir():
             if any(not _NUMBER.fullmatch(p.name) for p in path.iterdir()):
