@@ -258,12 +258,8 @@ def _hear_signals(heard: list[int]) -> None:
 
 
 _NO_MEMORY = (
-    "failed to map segment",
-    "cannot allocate memory",
-    "can't start new thread",
-    "bad_alloc",
-    "bad allocation",
-    "out of memory",
+    *("failed to map segment", "cannot allocate memory", "can't start new thread", "bad_alloc", "bad allocation"),
+    *("out of memory", "error return without exception set"),  # the second: Python, where an import lost its error
 )
 
 

@@ -167,6 +167,7 @@ def test_an_interrupt_during_the_imports_is_one_line() -> None:
         ImportError("libx.so: failed to map segment from shared object"),
         OSError(12, "Cannot allocate memory"),
         RuntimeError("std::bad_alloc"),
+        SystemError("error return without exception set"),
     ],
 )
 def test_a_lack_of_memory_is_called_so_whoever_says_it(
