@@ -44,10 +44,13 @@ def solve_submaps_isam2(
     check_identified(submaps)
     start = time.perf_counter()
     graph = FactorGraph()
-    solver = Isam2Solver(graph)
-    for submap in Bar(submaps, name="iSAM2", unit="submap", shown=progress):
+    # The landmarks have ids, so nothing uses the poses before the end: relinearised whenever the map grew by a fifth.
+    solver = Isam2Solver(graph, relinearize_skip=len(submaps) + 1)
+    due = 0
+    for k, submap in enumerate(Bar(submaps, name="iSAM2", unit="submap", shown=progress)):
         graph.add_submap(submap)
-        solver.update()
+        solver.update(relinearize=k >= due or k == len(submaps) - 1)
+        due = k + max(10, k // 5) if k >= due else due
     objective = graph.objective().total
     polished = None
     if polish:

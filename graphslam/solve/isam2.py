@@ -110,12 +110,14 @@ class Isam2Solver:
         self._odd: int | None = None  # a factor that is not relative to the datum
         self._read: int  # processed entries of the graph's journal
         self._since_pull = 0
+        self._force = False
         self._forget()
 
     # ---------------------------------------------------------------- interface
 
-    def update(self) -> None:
-        """Add the changes of the graph since the last update to iSAM2, and use the new estimate."""
+    def update(self, *, relinearize: bool = False) -> None:
+        """Add the changes of the graph since the last update; ``relinearize``: whatever ``relinearize_skip``."""
+        self._force = relinearize
         t0 = time.perf_counter()
         try:
             self._update()
@@ -178,7 +180,7 @@ class Isam2Solver:
         lost = self._known - {"x0", *self.graph.structure.layout().names()} if removed else set()
         if changed or lost or (self._isam is not None and self._in_gps_frame(new) == ("x0" in self._fixed)):
             self._rebuild(new, removed)
-        elif new or removed or not self.updates:
+        elif new or removed or self._force or not self.updates:
             self._check_fresh(new)
             try:
                 self._feed(new, removed)
@@ -245,7 +247,7 @@ class Isam2Solver:
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = [self._held[i][1] for i in removed]
         loops = (isinstance(r, BetweenRecord) and fresh.keys().isdisjoint(r.variables()) for r in new)
-        parameters.force_relinearize = any(loops)
+        parameters.force_relinearize = self._force or any(loops)
         if self._isam is None:
             self._isam = self._new()
         slots = list(self._isam.update(factors, values, parameters).getNewFactorsIndices())

@@ -229,6 +229,15 @@ def test_removal_and_merging_follow_the_graph(rng):
     assert "datum" not in solver._known
 
 
+def test_relinearisation_on_demand(rng):
+    chain = make_chain(rng, m=30, landmarks=30, laps=2.0)
+    _, solver = grown(chain, relinearize_skip=1000, relinearize_threshold=1e-4, relinearize_angle=1e-5)
+    before = solver.gap()
+    for _ in range(3):
+        solver.update(relinearize=True)
+    assert solver.gap() < 0.01 * before
+
+
 def test_an_update_without_news_does_nothing(rng):
     g, solver = grown(make_chain(rng, m=4))
     updates, values = solver.updates, g.values

@@ -216,8 +216,16 @@ class SubmapBatch(FactorBatch):
 
     @classmethod
     def gtsam(cls, record: SubmapRecord | PathRecord, constants: Fixed) -> gtsam.NonlinearFactor:
-        """A custom factor by the same kernel."""
-        return submap_factor(record, constants)
+        """A custom factor by the same kernel; a repeated landmark has one key, with the sum of its Jacobians."""
+        entries = record.entries()
+        unique = {name: k for k, name in enumerate(dict.fromkeys(entries))}
+        entry_of = np.array([unique[name] for name in entries], dtype=np.intp)
+        origin = constants.get(f"x{record.start}")
+        names = [] if origin is not None else [f"x{record.start}"]
+        names += [f"x{record.start + 1}", *unique]
+        widths = [3 if n[0] == "x" else 2 for n in names]
+        terms = _terms([gtsam_key(n) for n in names], entry_of, record, origin)
+        return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
 
 
 class PathBatch(SubmapBatch):
@@ -239,22 +247,6 @@ def submap_jacobian(
     n = len(points)
     every = np.arange(n, dtype=np.int64)
     return whiten_submap(ends, points, every, z, n if places is None else places, chart == "group", np.eye(3 + 2 * n))
-
-
-def submap_factor(record: SubmapRecord | PathRecord, constants: Fixed) -> gtsam.CustomFactor:
-    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start if that is the fixed first base.
-
-    A repeated landmark has one key, whose Jacobian is the sum of its entries.
-    """
-    entries = record.entries()
-    unique = {name: k for k, name in enumerate(dict.fromkeys(entries))}
-    entry_of = np.array([unique[name] for name in entries], dtype=np.intp)
-    origin = constants.get(f"x{record.start}")
-    names = [] if origin is not None else [f"x{record.start}"]
-    names += [f"x{record.start + 1}", *unique]
-    widths = [3 if n[0] == "x" else 2 for n in names]
-    terms = _terms([gtsam_key(n) for n in names], entry_of, record, origin)
-    return safe_factor(gtsam.noiseModel.Unit.Create(record.rows), names, widths, record.rows, terms)
 
 
 def _terms(
