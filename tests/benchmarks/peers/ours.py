@@ -288,7 +288,7 @@ def register(folder: Path) -> Measured:
         found = []
         for k, start in enumerate(starts):
             target, source = (Target(clouds[i].astype(np.float64), voxel=0.3) for i in (2 * k, 2 * k + 1))
-            found.append(register(source, target, start).T)
+            found.append(register(source, target, start).T_target_source)
         return {"path": np.array(found)}
 
     return call
