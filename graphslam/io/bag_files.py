@@ -141,11 +141,11 @@ class BagFiles:
         """Messages of topics, in the order of the bag, up to the end of a truncated bag, which is counted."""
         for r in self.readers:
             chosen = [c for c in r.connections if c.topic in names and c.msgtype == self.topics[c.topic].type]
-            why, count, first, last = self.faults[id(r)], 0, 0, 0
+            why, count, first, last = self.faults[id(r)], 0, 0.0, 0.0
             try:
                 for c, t, raw in r.messages(chosen) if chosen else ():
-                    first, last, count = first if count else t, t, count + 1
-                    yield c.topic, cut.unpack_message(bytes(raw)), 1e-9 * t
+                    first, last, count = first if count else 1e-9 * t, 1e-9 * t, count + 1  # an error if t is no number
+                    yield c.topic, cut.unpack_message(bytes(raw)), last
             except GraphSlamError:
                 raise
             except Exception as error:
@@ -154,7 +154,7 @@ class BagFiles:
                 drops.drop(
                     "bag",
                     f"is damaged or cut off ({why}); read up to there: {count} messages in"
-                    f" {1e-9 * (last - first):.1f} s, the last at {1e-9 * last:.3f}",
+                    f" {last - first:.1f} s, the last at {last:.3f}",
                 )
 
     def decode(self, raw: bytes, kind: str) -> Any:

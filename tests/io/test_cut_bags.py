@@ -98,6 +98,15 @@ def test_a_cut_before_the_first_message_is_refused_with_what_to_do(tmp_path: Pat
         load_recording(path)
 
 
+def test_a_database_is_read_up_to_a_stamp_that_is_no_number(tmp_path: Path) -> None:
+    path = write(tmp_path, "db3")
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = x'00' WHERE id = 199")  # sorted behind all numbers
+    log = load_recording(path)
+    holds_the_first(log, N, N)
+    assert "199 messages" in bag_fault(log)
+
+
 @pytest.mark.parametrize("mode", ["wal", "delete"])
 def test_a_journal_beside_a_database_is_applied(tmp_path: Path, mode: str) -> None:
     """What a recorder wrote last is in the WAL; a rollback journal undoes a transaction that was not finished."""
