@@ -442,9 +442,7 @@ def _las_count(head: bytes, length: int, where: str) -> int:
     size = int(np.frombuffer(head[105:107], "<u2")[0])
     if not head[104] & 0x80 and n * size > length:
         raise FormatError("file is truncated", where=where, got=f"{length} bytes", wanted=f"{n} points of {size}")
-    extra = int(np.frombuffer(head[100:104], "<u4")[0])
-    if head[25] >= 4 and len(head) >= 247:
-        extra += int(np.frombuffer(head[243:247], "<u4")[0])
+    extra = sum(int.from_bytes(head[k : k + 4], "little") for k in ((100, 243) if head[25] >= 4 else (100,)))
     if extra * 54 > length:  # laspy would try to read all of them, for hours
         raise FormatError("LAS header claims too many records", where=where, got=extra, wanted=f"in {length} bytes")
     check_size(n * 24, where)
@@ -464,6 +462,7 @@ def _check_chunks(raw: bytes, header: Any, where: str) -> None:
     packing = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
     points = io.BytesIO(raw)
     points.seek(first)
-    sizes = [size for _, size in lazrs.read_chunk_table(points, packing)]
-    if packing.item_size() != header.point_format.size or sum(sizes) > len(raw):
+    chunks = lazrs.read_chunk_table(points, packing)  # points and bytes of each
+    if packing.item_size() != header.point_format.size or sum(size for _, size in chunks) > len(raw):
         raise FormatError("LAZ is damaged: the size of its points or chunks is impossible", where=where)
+    check_size(max((n for n, _ in chunks), default=0) * packing.item_size(), where)  # the decoder allocates this

@@ -160,6 +160,15 @@ def test_sizes_of_packed_points_are_checked_before_the_decoder_prints_a_panic(
     assert capfd.readouterr().err == ""
 
 
+def test_a_chunk_of_four_billion_points_is_refused_before_the_decoder_allocates_it(tmp_path: Path) -> None:
+    folder = small.cloud_folder(tmp_path / "a", "laz", n=1, spacing=1.0)
+    raw = (folder / "scan_0.laz").read_bytes()
+    where = raw.index((50_000).to_bytes(4, "little"))  # points per chunk, in the header of the compression
+    (tmp_path / "a.laz").write_bytes(raw[:where] + b"\xff\xff\xff\xf0" + raw[where + 4 :])
+    with pytest.raises(FormatError, match="more data than is read"):
+        read_cloud(tmp_path / "a.laz")
+
+
 def test_a_las_file_that_claims_a_billion_records_is_refused_at_once(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "las", n=2, spacing=1.0)
     raw = bytearray((folder / "scan_0.las").read_bytes())
