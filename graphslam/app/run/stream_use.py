@@ -89,7 +89,7 @@ def stream_use(
             factors = sum(isinstance(r, GpsRecord) for r in graph.records.values())
             used = min(used, factors)  # fixes that wait for a datum to the end are in the ledger, and in no factor
             if not asked:
-                why = "gps.use is none"
+                why = "gps.use is none; every-second: half of the fixes in the map, the others as a test"
             elif used == 0 and spent.any():
                 why = (
                     f"its {int(spent.sum())} fixes on the path span less than {settings.gps.baseline:g} m, so the "

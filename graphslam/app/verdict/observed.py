@@ -37,7 +37,9 @@ def findings_from_run(
     events : sequence of mapping
         Events of the graph; ``outlier``, ``gps-errors``, ``no-effect`` and ``beacon-not-placed`` become lines.
     """
-    counts = "; ".join(s.text() for s in streams)
+    counts = "; ".join(
+        s.text() + (f" ({s.why})" if s.why and not (s.used or s.asked or s.role == "input") else "") for s in streams
+    )
     out = [Finding("", "streams", f"records used: {counts}.")] if streams else []
     for s in streams:
         if s.used == 0 and s.asked:
