@@ -52,7 +52,7 @@ class Imu:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     angular_rate : (n, 3)
         [rad/s], frame of the unit.
     specific_force : (n, 3)
@@ -60,7 +60,7 @@ class Imu:
     noise : ImuNoise
     attitude : (n, 2) or None
         Roll and pitch estimated by the unit [rad].
-    T_base_imu : (7,)
+    T_base_imu : (7,), position [m] and quaternion (x, y, z, w)
 
     Examples
     --------

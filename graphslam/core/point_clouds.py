@@ -118,7 +118,7 @@ class PointClouds:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     source : CloudSource
     index : (n,) int64, optional
         Scan of the source for each record; default: all in order.

@@ -32,7 +32,7 @@ class RangeScans:
         Unit vectors, frame of the head.
     beam_times : (m,)
         Seconds after the stamp, not decreasing.
-    max_range : float
+    max_range : float [m]
     sigma : float
         Standard deviation of a range [m].
     T_base_mount : (7,)

@@ -89,14 +89,14 @@ class LaserScans:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     ranges : (n, m)
         Metres, float32 or float64; ``nan`` or ≥ ``max_range`` means no return.
     bearings : (m,)
         Beam directions in the sensor frame, radians, counter-clockwise, strictly increasing.
     max_range : float
         Ranges at or above it are "no return".
-    T_base_sensor : (3,)
+    T_base_sensor : (3,) [m, m, rad]
 
     Examples
     --------
@@ -159,7 +159,7 @@ class SteeringControls:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     speed : (n,)
         Wheel speed [m/s].
     steering : (n,)
@@ -203,7 +203,7 @@ class VelocityControls:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     speed : (n,)
         Along x of the base [m/s], negative backwards.
     yaw_rate : (n,)
@@ -237,8 +237,8 @@ class Odometry:
 
     Parameters
     ----------
-    times : (n,)
-    increments : (n, 3) or (n, 7)
+    times : (n,) [s]
+    increments : (n, 3) [m, m, rad] or (n, 7), position [m] and quaternion (x, y, z, w)
     covariances : (n, d, d)
         Right tangent at the later pose. Required.
 
@@ -277,8 +277,8 @@ class Gps:
 
     Parameters
     ----------
-    times : (n,)
-    positions : (n, 2) or (n, 3)
+    times : (n,) [s]
+    positions : (n, 2) or (n, 3) [m]
     sigma : (n,)
         Standard deviation of each coordinate [m].
     lever : (2,) or (3,)
@@ -365,7 +365,7 @@ class Compass:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     headings : (n,)
         Of the body's x axis [rad], counter-clockwise from magnetic east. For a compass that counts clockwise from north
         it is ``π/2`` minus its reading.
@@ -398,7 +398,7 @@ class Barometer:
 
     Parameters
     ----------
-    times : (n,)
+    times : (n,) [s]
     heights : (n,)
         [m], upwards.
     sigma : (n,)
@@ -440,10 +440,10 @@ class LandmarkObservations:
         builds such a stream).
     ids : (q,) int64 or None
         Known identity; -1 if unknown; None if the sensor gives none.
-    max_range : float
+    max_range : float [m]
     field_of_view : (2,)
         Least and largest bearing [rad].
-    T_base_sensor : (3,)
+    T_base_sensor : (3,) [m, m, rad]
 
     Examples
     --------
@@ -558,10 +558,10 @@ class PointObservations:
         Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
     points : (q, 3)
         In the sensor frame [m].
-    covariances : (q, 3, 3)
+    covariances : (q, 3, 3) [m²]
     ids : (q,) int64
         Identity of each, not negative; unique in a scan.
-    T_base_sensor : (7,)
+    T_base_sensor : (7,), position [m] and quaternion (x, y, z, w)
 
     Examples
     --------

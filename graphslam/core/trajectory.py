@@ -31,7 +31,7 @@ class Trajectory:
     ----------
     times : (n,)
         Strictly increasing [s].
-    poses : (n, 3) or (n, 7)
+    poses : (n, 3) [m, m, rad] or (n, 7), position [m] and quaternion (x, y, z, w)
     covariances : (n, d, d) or None
         Right tangent, GTSAM order; d = 3 or 6.
 
