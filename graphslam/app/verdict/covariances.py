@@ -78,7 +78,7 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
         if figures.part("refine"):
             text += " The noise of the refined path was estimated from its own residuals, so they cannot test it."
         if found.missing:
-            text += " Use GPS (gps.use), control points or loop closures."
+            text += f" Use {'' if 'fixes' in found.missing else 'GPS (gps.use), '}control points or loop closures."
         return [Finding("", "trust", text)]
     if found.verdict == "conservative":
         text = f"covariances: conservative — below the bounds: {tests}; residuals are not time-correlated. {rest}."
