@@ -107,7 +107,7 @@ class Isam2Solver:
         self._held: dict[int, tuple[FactorRecord, int]]  # factor id -> (record, slot)
         self._known: set[str]
         self._fixed: Fixed  # constants of the factors in iSAM2: the first base, or datum and tilt
-        self._odd: int | None = None  # a factor that is not relative to the datum
+        self._world_factor: int | None = None  # id of a factor that depends on the world frame
         self._read: int  # processed entries of the graph's journal
         self._since_pull = 0
         self._force = False
@@ -178,7 +178,8 @@ class Isam2Solver:
         new, removed = self._difference()
         changed = [i for i in removed if i in self.graph.records]  # re-keyed by a merge
         lost = self._known - {"x0", *self.graph.structure.layout().names()} if removed else set()
-        if changed or lost or (self._isam is not None and self._in_gps_frame(new) == ("x0" in self._fixed)):
+        moves = self._isam is not None and self._in_gps_frame(new) != ("x0" not in self._fixed)  # to the other frame
+        if changed or lost or moves:
             self._rebuild(new, removed)
         elif new or removed or self._force or not self.updates:
             self._check_fresh(new)
@@ -211,14 +212,14 @@ class Isam2Solver:
 
     def _in_gps_frame(self, new: list[FactorRecord]) -> bool:
         """Can iSAM2 have the poses in the GPS frame? ``new``: records that it does not have yet."""
-        if self.graph.structure.datum is None or self._odd in self.graph.records:
+        if self.graph.structure.datum is None or self._world_factor in self.graph.records:
             return False
         start = "x0" in self._fixed
         if start and not any("datum" in r.variables() for r in new):
             return False
         records = self.graph.records.values() if start else new
-        self._odd = next((r.factor_id for r in records if not batch_of(type(r)).relative), None)
-        return self._odd is None
+        self._world_factor = next((r.factor_id for r in records if not batch_of(type(r)).relative), None)
+        return self._world_factor is None
 
     def _frame(self) -> Any:
         """``T_gps_world`` in GTSAM's form; None if poses are in the world frame."""

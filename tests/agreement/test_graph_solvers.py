@@ -73,7 +73,7 @@ def test_objective_and_marginals_are_gtsams(rng):
     g = build(rng, gps=True, robust=RobustKernel("huber", 1.0))
     factors = gtsam.NonlinearFactorGraph()
     for r in g.records.values():
-        factors.push_back(gtsam_factor(r, g.origin))
+        factors.push_back(gtsam_factor(r, {"x0": g.origin}))
     assert 2 * factors.error(to_gtsam(g.values)) == pytest.approx(g.objective().total, rel=1e-11)  # anywhere
     BatchSolver(g).update()
     values = to_gtsam(g.values)

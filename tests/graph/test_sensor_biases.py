@@ -91,7 +91,7 @@ def test_factor_of_gtsam_has_the_same_residual_and_jacobians(graph, rng, group):
     records = [r for r in graph.records.values() if r.group == group]
     row = graph.flat().layout
     for r in (records[0], records[-1]):
-        factor = gtsam_factor(r, values.poses[0])
+        factor = gtsam_factor(r, {"x0": values.poses[0]})
         held = gtsam.Values()
         names = [n for n in r.variables() if n != "x0"]
         for n in names:

@@ -90,7 +90,7 @@ def test_a_pose_tangent_is_gtsams_rotation_first(rng):
     np.testing.assert_allclose(gtsam_pose(T).AdjointMap(), SE3.adjoint(T), atol=1e-12)
     # a covariance goes in and comes out by the same places
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    factors.push_back(gtsam_factor(BetweenRecord(0, 0, 1, T, whitener(C)), SE3.identity))
+    factors.push_back(gtsam_factor(BetweenRecord(0, 0, 1, T, whitener(C)), {"x0": SE3.identity}))
     values.insert(gtsam_key("x1"), gtsam_pose(T))
     np.testing.assert_allclose(
         gtsam.Marginals(factors, values).marginalCovariance(gtsam_key("x1")), C, rtol=1e-9, atol=1e-15
@@ -149,7 +149,7 @@ def test_every_factor_is_gtsams(rng):
     records, values = rich_records(rng)
     theirs, layout = to_gtsam(values), values.layout()
     for record in records:
-        factor = gtsam_factor(record, values.poses[0])
+        factor = gtsam_factor(record, {"x0": values.poses[0]})
         one = FactorArrays([record], layout).evaluate(values, dense=True)
         assert 2 * factor.error(theirs) == pytest.approx(one.objective, rel=1e-9), record.label()
         gaussian = factor.linearize(theirs)
@@ -202,7 +202,7 @@ def test_marginals_are_gtsams_and_those_of_a_monte_carlo(rng):
     BatchSolver(reference).solve_to_optimum()
     factors = gtsam.NonlinearFactorGraph()
     for r in reference.records.values():
-        factors.push_back(gtsam_factor(r, reference.origin))
+        factors.push_back(gtsam_factor(r, {"x0": reference.origin}))
     marginals = gtsam.Marginals(factors, to_gtsam(reference.values))
     for name in ("x1", "x3"):
         ours = reference.covariance().marginal(name)

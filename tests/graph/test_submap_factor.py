@@ -21,7 +21,7 @@ def build(rng, start: int, ids: np.ndarray, chart: str = "cartesian"):
     n = len(ids)
     z = np.concatenate([[3.0, 1.0, 0.4], rng.normal(0, 5, 2 * n)])
     P = correlated_covariance(rng, 3 + 2 * n, 0.3)
-    factor = gtsam_factor(SubmapRecord(0, 0, start, ids, z, whitener(P), chart=chart), np.zeros(3))
+    factor = gtsam_factor(SubmapRecord(0, 0, start, ids, z, whitener(P), chart=chart), {"x0": np.zeros(3)})
     poses = {start: np.array([1.0, -2.0, 2.9]) if start else np.zeros(3), start + 1: np.array([4.0, 1.0, -2.8])}
     points = {int(i): rng.normal(0, 5, 2) for i in ids}
     values = gtsam.Values()
@@ -75,7 +75,7 @@ def test_without_landmarks_it_is_a_between_factor(rng):
         g = FactorGraph()
         g.add_submap(make(0, base, P))
         g.add_submap(make(1, exit_pose, P))
-        systems.append([gtsam_factor(r, g.origin).linearize(to_gtsam(g.values)) for r in g.records.values()])
+        systems.append([gtsam_factor(r, {"x0": g.origin}).linearize(to_gtsam(g.values)) for r in g.records.values()])
     for ours, native in zip(*systems):
         np.testing.assert_allclose(ours.information(), native.information(), rtol=1e-9)
 
@@ -88,7 +88,7 @@ def test_linearised_factor_gives_back_mean_and_covariance(rng):
     np.testing.assert_allclose(g.values.poses[1], s.landmarks.exit_pose, atol=1e-12)
     np.testing.assert_allclose(g.values.landmarks, s.landmarks.positions, atol=1e-12)
     (record,) = g.records.values()
-    linear = gtsam_factor(record, g.origin).linearize(to_gtsam(g.values))
+    linear = gtsam_factor(record, {"x0": g.origin}).linearize(to_gtsam(g.values))
     names = [key_name(k) for k in list(linear.keys())]
     assert names == g.flat().layout.names()
     P = np.linalg.inv(linear.information())
@@ -105,7 +105,7 @@ def test_it_never_raises_and_fills_every_jacobian(rng):
 
 def test_heading_is_wrapped(rng):
     z = np.array([1.0, 0.0, np.pi - 0.01])
-    factor = gtsam_factor(SubmapRecord(0, 0, 1, np.zeros(0, dtype=np.int64), z, np.eye(3)), np.zeros(3))
+    factor = gtsam_factor(SubmapRecord(0, 0, 1, np.zeros(0, dtype=np.int64), z, np.eye(3)), {"x0": np.zeros(3)})
     values = gtsam.Values()
     values.insert(gtsam_key("x1"), gtsam.Pose2(0, 0, 0))
     values.insert(gtsam_key("x2"), gtsam.Pose2(1, 0, -np.pi + 0.01))

@@ -24,7 +24,7 @@ def optimise_with_gtsam(graph: FactorGraph, *, max_iterations: int = 100) -> tup
     """
     factors = gtsam.NonlinearFactorGraph()
     for record in graph.records.values():
-        factors.push_back(gtsam_factor(record, graph.origin))
+        factors.push_back(gtsam_factor(record, {"x0": graph.origin}))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(0.0)

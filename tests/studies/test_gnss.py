@@ -103,7 +103,7 @@ def test_every_solver_ends_at_the_same_place():
     assert theirs == pytest.approx(ours, rel=1e-6)
     np.testing.assert_allclose(step_by_step.values.poses[:, :3], batch.values.poses[:, :3], atol=1e-2)
     values = to_gtsam(batch.values)
-    total = sum(2.0 * gtsam_factor(r, batch.origin).error(values) for r in batch.records.values())
+    total = sum(2.0 * gtsam_factor(r, {"x0": batch.origin}).error(values) for r in batch.records.values())
     assert total == pytest.approx(ours, rel=1e-6)
 
 

@@ -258,9 +258,9 @@ def _hear_signals(heard: list[int]) -> None:
 
 
 _NO_MEMORY = (
-    *("failed to map segment", "cannot allocate memory", "can't start new thread", "bad_alloc", "bad allocation"),
-    *("out of memory", "error return without exception set"),  # the second: Python, where an import lost its error
-)
+    "failed to map segment", "cannot allocate memory", "can't start new thread", "bad_alloc", "bad allocation",
+    "out of memory", "error return without exception set",  # the last: Python, where an import lost its error
+)  # fmt: skip
 
 
 def lacks_memory(error: BaseException | None) -> bool:

@@ -307,16 +307,15 @@ Fixed = Mapping[str, Array]
 """Variables that are constant, by name."""
 
 
-def gtsam_factor(record: Any, fixed: Array | Fixed) -> gtsam.NonlinearFactor:
+def gtsam_factor(record: Any, fixed: Fixed) -> gtsam.NonlinearFactor:
     """The GTSAM factor of a record, without keys for constant variables.
 
     Parameters
     ----------
-    fixed : (3,), (7,) or mapping
-        The pose of the fixed first base. Or all constants by name: with datum and tilt at the identity, poses are
-        in the GPS frame and the first base is free.
+    fixed : mapping of str to (k,)
+        Of the first base ``x0``; or datum and tilt at the identity: poses are in the GPS frame, the first base is free.
     """
-    return batch_of(type(record)).gtsam(record, {"x0": fixed} if isinstance(fixed, np.ndarray) else fixed)
+    return batch_of(type(record)).gtsam(record, fixed)
 
 
 # ------------------------------------------------------------------------------------------------ GTSAM

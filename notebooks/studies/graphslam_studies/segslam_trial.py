@@ -212,12 +212,12 @@ class GridTrial:
             effective = result.effective / result.report()["particles"]
             yield Measurement(name, "effective_median", float(np.median(effective)))
             yield Measurement(name, "maps_megabytes", result.used_bytes / 1e6)
-            survivors = float(result.ancestry.survivors().mean())
-            yield Measurement(name, "survivors", survivors)
+            alternatives = survivors = float(result.ancestry.survivors().mean())
             if isinstance(result, SegSlamResult):
                 t, alive = result.segmap.table, result.segmap.alive
-                survivors = float(np.sum(t.end[alive] - t.start[alive])) / len(self.steps)
-            yield Measurement(name, "alternatives", survivors)
+                alternatives = float(np.sum(t.end[alive] - t.start[alive])) / len(self.steps)
+            yield Measurement(name, "survivors", survivors)
+            yield Measurement(name, "alternatives", alternatives)
         if "legs" in wanted:
             yield Measurement(name, "leg_angle", self.leg_angle(outcome.path.poses))
         if "climbs" in wanted:

@@ -9,8 +9,7 @@ tree along arcs. ``…+polish``: the least-squares optimum of the same maps.
 Strategies: ``fixed-N``: N scans. ``features-N``: criterion (iii) alone, N features in the standard particle.
 ``rule-N``: (i) a time without features, (ii) diversity lost, (iii) N features, with the values of the preset
 ``paper.rbpf-ekf``. ``rule-N-early``: (ii) at 10 ancestors instead of one. ``rule-N-no-time``,
-``rule-N-no-diversity``: without (i), without (ii). ``own``: the default of the
-front end.
+``rule-N-no-diversity``: without (i), without (ii). ``own``: the default of the front end.
 
 Quantities
 ----------

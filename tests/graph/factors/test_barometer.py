@@ -68,7 +68,7 @@ def test_jacobians_and_gtsam(rng, tilt):
     theirs, blocks = to_gtsam(values), g.flat().factor_blocks(values)
     for record, d2 in zip(blocks.records, blocks.d2):
         if isinstance(record, BarometerRecord):
-            assert 2 * gtsam_factor(record, g.origin).error(theirs) == pytest.approx(d2, rel=1e-9)
+            assert 2 * gtsam_factor(record, {"x0": g.origin}).error(theirs) == pytest.approx(d2, rel=1e-9)
 
 
 def test_solvers_agree_and_heights_are_consistent():

@@ -144,7 +144,7 @@ def test_gtsam_factors_are_the_batches(rng, dim):
     blocks, theirs, seen = graph.flat().factor_blocks(values), to_gtsam(values), set()
     for record, columns, H, d2 in zip(blocks.records, blocks.columns, blocks.H, blocks.d2):
         if isinstance(record, KINDS):
-            factor = gtsam_factor(record, graph.origin)
+            factor = gtsam_factor(record, {"x0": graph.origin})
             assert 2 * factor.error(theirs) == pytest.approx(d2, rel=1e-8)
             A, _ = factor.linearize(theirs).jacobian()
             free = columns >= 0

@@ -96,7 +96,7 @@ def test_jacobians_and_gtsam(rng, make):
     theirs, blocks = to_gtsam(values), g.flat().factor_blocks(values)
     for record, loss in zip(blocks.records, g.flat().evaluate(values, hessian=False).chi2):
         if isinstance(record, (ControlRecord, DistanceRecord)):
-            assert 2 * gtsam_factor(record, g.origin).error(theirs) == pytest.approx(loss, rel=1e-6, abs=1e-9)
+            assert 2 * gtsam_factor(record, {"x0": g.origin}).error(theirs) == pytest.approx(loss, rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("make", [planar, spatial])

@@ -112,7 +112,7 @@ def test_its_own_jacobian_is_used_and_gtsam_gets_the_same():
         np.testing.assert_allclose(J, 5.0 * np.asarray(slope(*values)), atol=1e-8)
         at = gtsam.Values()
         insert_values(at, record.variables(), graph.values, graph.landmark_rows)
-        linear = gtsam_factor(record, graph.origin).linearize(at)
+        linear = gtsam_factor(record, {"x0": graph.origin}).linearize(at)
         np.testing.assert_allclose(linear.jacobian()[0], J, atol=1e-12)
         np.testing.assert_allclose(linear.jacobian()[1], -r, atol=1e-12)
     assert len(calls) > 3

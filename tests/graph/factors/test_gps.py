@@ -35,7 +35,7 @@ def test_factor_jacobians_by_finite_differences(rng, node, bias):
     record = GpsRecord(0, node, 1.0, np.array([3.0, -1.0]), np.array([8.0, 5.0]), W, bias=bias)
     pose = np.array([4.0, 2.0, 2.0]) if node else np.zeros(3)
     datum, b = np.array([1.0, 2.0, -0.6]), np.array([0.3, -0.7])
-    factor = gtsam_factor(record, np.zeros(3))
+    factor = gtsam_factor(record, {"x0": np.zeros(3)})
     values = gtsam.Values()
     state = {"datum": datum}
     if node:

@@ -57,7 +57,7 @@ def test_jacobians_and_gtsam_agree(rng):
         by_step = (batch.whitened(values.retract(d))[0] - batch.whitened(values.retract(-d))[0]) / 2e-5
         np.testing.assert_allclose(np.where((columns == c)[:, None], J, 0.0).sum(axis=2), by_step, atol=1e-5)
     theirs = to_gtsam(values)
-    total = sum(2.0 * gtsam_factor(r, g.origin).error(theirs) for r in batch.records)
+    total = sum(2.0 * gtsam_factor(r, {"x0": g.origin}).error(theirs) for r in batch.records)
     assert total == pytest.approx(batch.squared(values).sum(), rel=1e-9)
 
 

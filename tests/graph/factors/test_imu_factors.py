@@ -122,7 +122,7 @@ def test_the_way_is_gtsams_own(rng):
     y = np.concatenate([x[:3] + v + 0.5 * g + turn @ pim.p[0], se3.quat_multiply(x[3:], se3.matrix_to_quat(pim.R[0]))])
     w, sigma = v + g + turn @ pim.v[0], np.sqrt(np.diag(P))
     values, theirs_factor = gtsam.Values(), gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, theirs)
-    factor = gtsam_factor(record, SE3.identity)
+    factor = gtsam_factor(record, {"x0": SE3.identity})
     at = SE3.compose(y, SE3.exp(2 * sigma[:6] * rng.normal(size=6)))
     w = w + 2 * sigma[6:9] * rng.normal(size=3)
     a, b = 0.01 * rng.normal(size=(2, 6)) * [1, 1, 1, 5, 5, 5]
@@ -148,7 +148,7 @@ def test_gtsam_factors_are_the_batches(rng):
     for record, columns, H, d2 in zip(blocks.records, blocks.columns, blocks.H, blocks.d2):
         if not isinstance(record, ImuRecord | ImuBiasRecord | ForceRecord):
             continue
-        factor = gtsam_factor(record, g.origin)
+        factor = gtsam_factor(record, {"x0": g.origin})
         assert 2 * factor.error(theirs) == pytest.approx(d2, rel=1e-9)
         A, _ = factor.linearize(theirs).jacobian()
         free = columns >= 0

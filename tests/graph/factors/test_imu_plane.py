@@ -87,7 +87,7 @@ def test_gtsam_factors_are_the_batches(rng):
     blocks, theirs, seen = g.flat().factor_blocks(values), to_gtsam(values), 0
     for record, columns, H, d2 in zip(blocks.records, blocks.columns, blocks.H, blocks.d2):
         if isinstance(record, ImuRecord | ImuBiasRecord):
-            factor = gtsam_factor(record, g.origin)
+            factor = gtsam_factor(record, {"x0": g.origin})
             assert 2 * factor.error(theirs) == pytest.approx(d2, rel=1e-9)
             A, _ = factor.linearize(theirs).jacobian()
             free = columns >= 0

@@ -176,7 +176,7 @@ def test_the_factor_is_gtsams(dim: int) -> None:
     values = gtsam.Values()
     values.insert(gtsam.symbol("x", 1), gtsam_pose(pose))
     r = W @ (pose[:dim] - z)
-    own = gtsam_factor(record, g.identity)
+    own = gtsam_factor(record, {"x0": g.identity})
     assert type(own) is (gtsam.PoseTranslationPrior2D if dim == 2 else gtsam.PoseTranslationPrior3D)
     factors = [own]
     if dim == 3:
