@@ -155,6 +155,11 @@ def se2_right_jacobian(xi: ArrayLike) -> Array:
     return out
 
 
+def se2_right_jacobian_inverse(xi: ArrayLike) -> Array:
+    """``J_r⁻¹`` ``(..., 3, 3)``: ``Log(Exp(ξ) Exp(δ)) ≈ ξ + J_r⁻¹ δ``."""
+    return np.asarray(np.linalg.inv(se2_right_jacobian(xi)))
+
+
 def vector_to_tangent_covariance(pose: ArrayLike, cov_vector: ArrayLike) -> Array:
     """Covariance of (x, y, θ) *in the parent frame* → right-tangent covariance ``(..., 3, 3)`` of the same pose.
 

@@ -47,17 +47,19 @@ class Group:
     log: Callable[[ArrayLike], Array]
     adjoint: Callable[[ArrayLike], Array]
     right_jacobian: Callable[[ArrayLike], Array]
+    right_jacobian_inverse: Callable[[ArrayLike], Array]
     transform: Callable[[ArrayLike, ArrayLike], Array]
 
 
 SE2 = Group(
     2, 3, 3, np.zeros(3), 2, slice(0, 2), geometry.se2_compose, geometry.se2_inverse, geometry.se2_between,
     geometry.se2_exp, geometry.se2_log, geometry.se2_adjoint, geometry.se2_right_jacobian,
-    geometry.se2_transform,
+    geometry.se2_right_jacobian_inverse, geometry.se2_transform,
 )  # fmt: skip
 SE3 = Group(
     3, 7, 6, np.array([0.0, 0, 0, 0, 0, 0, 1]), 2, slice(3, 6), se3.se3_compose, se3.se3_inverse, se3.se3_between,
-    se3.se3_exp, se3.se3_log, se3.se3_adjoint, se3.se3_right_jacobian, se3.se3_transform,
+    se3.se3_exp, se3.se3_log, se3.se3_adjoint, se3.se3_right_jacobian, se3.se3_right_jacobian_inverse,
+    se3.se3_transform,
 )  # fmt: skip
 
 

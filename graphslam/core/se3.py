@@ -152,35 +152,41 @@ def so3_log(q: ArrayLike) -> Array:
     return k * a[..., :3]
 
 
-def _coefficients(omega: Array) -> tuple[Array, Array]:
-    """``(1 - cos)/φ²`` and ``(φ - sin)/φ³`` with series near zero; each with two trailing axes."""
-    t2 = np.sum(omega**2, axis=-1)[..., None, None]
+def _coefficients(omega: Array) -> tuple[Array, Array, Array]:
+    """``(1 - cos)/φ²`` and ``(φ - sin)/φ³`` with series near zero, and ``φ²``; each with a trailing axis."""
+    t2 = np.sum(omega**2, axis=-1, keepdims=True)
     t = np.sqrt(t2)
     small = t < 1e-3
     safe = np.where(small, 1.0, t)
     a = np.where(small, 0.5 - t2 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe**2)
     b = np.where(small, 1.0 / 6.0 - t2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    return a, b
+    return a, b, t2
+
+
+def _matrix(outer: Array, vector: Array, diagonal: Array) -> Array:
+    """``outer + [vector]× + diagonal · I``: products of ``(..., 3, 3)`` with ``(..., 1, 1)`` are slow in NumPy."""
+    out = skew(vector)
+    out += outer
+    out[..., [0, 1, 2], [0, 1, 2]] += diagonal
+    return out
 
 
 def so3_left_jacobian(omega: ArrayLike) -> Array:
     """``J_l`` ``(..., 3, 3)``: ``Exp(ω + δ) ≈ Exp(J_l δ) Exp(ω)``; also the V matrix of SE(3)."""
     w = np.asarray(omega, dtype=np.float64)
-    W = skew(w)
-    a, b = _coefficients(w)
-    return np.eye(3) + a * W + b * (W @ W)
+    a, b, t2 = _coefficients(w)
+    return _matrix((b * w)[..., :, None] * w[..., None, :], a * w, 1.0 - b * t2)
 
 
 def so3_left_jacobian_inverse(omega: ArrayLike) -> Array:
     """Inverse of :func:`so3_left_jacobian`, closed form."""
     w = np.asarray(omega, dtype=np.float64)
-    W = skew(w)
-    t = np.linalg.norm(w, axis=-1)[..., None, None]
+    t = np.linalg.norm(w, axis=-1, keepdims=True)
     small = t < 1e-3
     safe = np.where(small, 1.0, t)
     half = safe / 2.0
     c = np.where(small, 1.0 / 12.0 + t**2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
-    return np.eye(3) - 0.5 * W + c * (W @ W)
+    return _matrix((c * w)[..., :, None] * w[..., None, :], -0.5 * w, 1.0 - c * t**2)
 
 
 def se3_compose(T_ab: ArrayLike, T_bc: ArrayLike) -> Array:
@@ -240,28 +246,35 @@ def se3_adjoint(T: ArrayLike) -> Array:
 
 
 def se3_right_jacobian(xi: ArrayLike) -> Array:
-    """``J_r`` ``(..., 6, 6)``: ``Exp(ξ + δ) ≈ Exp(ξ) Exp(J_r δ)`` (Barfoot & Furgale 2014, with rotation first)."""
+    """``J_r`` ``(..., 6, 6)``: ``Exp(ξ + δ) ≈ Exp(ξ) Exp(J_r δ)`` (Barfoot & Furgale 2014, with rotation first).
+
+    With ``k = w · ρ``, products of the skew matrices W and P of w and ρ are ``W² = w wᵀ - φ² I``, ``W P W = -k W``,
+    ``W P + P W = ρ wᵀ + w ρᵀ - 2 k I`` and ``W W P + P W W - 3 W P W = [w × (w × ρ) + k w]×``.
+    """
     v = -np.asarray(xi, dtype=np.float64)  # J_r(ξ) = J_l(-ξ)
     w, rho = v[..., :3], v[..., 3:]
-    J = so3_left_jacobian(w)
-    W, P = skew(w), skew(rho)
-    t = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = np.sum(w * rho, axis=-1, keepdims=True)
+    t = np.linalg.norm(w, axis=-1, keepdims=True)
     small = t < 1e-2
     s = np.where(small, 1.0, t)
     sin, cos = np.sin(s), np.cos(s)
     a = np.where(small, 1 / 6 - t**2 / 120, (s - sin) / s**3)
     b = np.where(small, 1 / 24 - t**2 / 720, (s**2 + 2 * cos - 2) / (2 * s**4))
     c = np.where(small, 1 / 120 - t**2 / 2520, (2 * s - 3 * sin + s * cos) / (2 * s**5))
-    Q = (
-        0.5 * P
-        + a * (W @ P + P @ W + W @ P @ W)
-        + b * (W @ W @ P + P @ W @ W - 3 * W @ P @ W)
-        + c * (W @ P @ W @ W + W @ W @ P @ W)
-    )
+    vector = 0.5 * rho - a * k * w + b * (_cross(w, _cross(w, rho)) + k * w)
+    outer = (a * rho - c * k * w)[..., :, None] * w[..., None, :]
     out = np.zeros(v.shape[:-1] + (6, 6))
-    out[..., :3, :3] = J
-    out[..., 3:, 3:] = J
-    out[..., 3:, :3] = Q
+    out[..., :3, :3] = out[..., 3:, 3:] = so3_left_jacobian(w)
+    out[..., 3:, :3] = _matrix(outer + np.swapaxes(outer, -1, -2), vector, 2.0 * k * (c * t**2 - a))
+    return out
+
+
+def se3_right_jacobian_inverse(xi: ArrayLike) -> Array:
+    """``J_r⁻¹`` ``(..., 6, 6)``: ``Log(Exp(ξ) Exp(δ)) ≈ ξ + J_r⁻¹ δ``."""
+    out = se3_right_jacobian(xi)
+    J = so3_left_jacobian_inverse(-np.asarray(xi, dtype=np.float64)[..., :3])
+    out[..., :3, :3] = out[..., 3:, 3:] = J
+    out[..., 3:, :3] = -J @ out[..., 3:, :3] @ J
     return out
 
 

@@ -217,7 +217,7 @@ class MotionModel:
         step = g.between(poses[:-1], poses[1:])
         raw = g.log(g.between(self.steps.odometry.increments[1:], step))
         e = raw - np.einsum("kij,kj->ki", self.B, self._state_rows(states))
-        Jr = np.linalg.inv(g.right_jacobian(raw))
+        Jr = g.right_jacobian_inverse(raw)
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
         return e[:, self.keep], J[:, self.keep]
 

@@ -57,7 +57,7 @@ class RevisitConstraints:
         a, b = self.steps.T
         step = g.between(path[a], path[b])
         e = g.log(g.between(self.poses, step))
-        Jr = np.linalg.inv(g.right_jacobian(e))
+        Jr = g.right_jacobian_inverse(e)
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr], axis=2)
         W = np.sqrt(weights)[:, None] / _sigmas(g)
         return MotionTerms(W * e, W[..., None] * J, self.steps, (g.dof, g.dof), "guides")

@@ -70,6 +70,7 @@ class BlockElimination:
 
         self.width = width
         ptr, nodes, _ = self._parts(H)
+        self._nodes = nodes
         row = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
         upper = row < nodes
         pattern = gtsam.SymbolicFactorGraph()
@@ -90,8 +91,10 @@ class BlockElimination:
         return B.indptr.astype(np.int64), B.indices.astype(np.int64), B.data.ravel()
 
     def factor(self, H: sp.csc_matrix) -> BlockFactor:
-        """Factorisation of a matrix with the pattern."""
+        """Factorisation of a matrix with the pattern; RuntimeError if it is not positive definite."""
         _, nodes, data = self._parts(H)
+        if not np.array_equal(nodes, self._nodes):  # a block became zero
+            return BlockElimination(H, self.width).factor(H)
         try:
             return self._symbolic.factor(np.arange(len(nodes)) * self.width**2, data)
         except IndeterminateError as error:

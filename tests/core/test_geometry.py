@@ -22,6 +22,7 @@ from graphslam.core.geometry import (
     vector_to_tangent_covariance,
     wrap_angle,
 )
+from graphslam.core.poses import group_of
 from tests.reference.compose_covariance import se2_compose_covariance
 from tests.reference.groups import GROUPS, SE2, SE3, Group, tangents
 
@@ -119,6 +120,8 @@ def test_right_jacobian_by_central_differences(group: Group, data: st.DataObject
         # Exp(ξ + δ) = Exp(ξ) Exp(J_r δ)
         column = group.log(group.between(group.exp(xi - d), group.exp(xi + d))) / (2 * h)
         assert np.abs(J[:, k] - column).max() < 2e-7
+    inverse = group_of(group.identity).right_jacobian_inverse(xi)
+    assert np.abs(inverse @ J - np.eye(group.dim)).max() < 1e-9
 
 
 @both

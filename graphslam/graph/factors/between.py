@@ -22,7 +22,7 @@ def between_terms(T_ij: Array, x_i: Array, x_j: Array) -> tuple[Array, Array]:
     G = group_of(T_ij)
     h = G.between(x_i, x_j)
     r = G.log(G.between(T_ij, h))
-    J_j = np.linalg.inv(G.right_jacobian(r))  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
+    J_j = G.right_jacobian_inverse(r)  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
     J_i = -J_j @ G.adjoint(G.inverse(h))  # x_i Exp(δ): h → Exp(-δ) h = h Exp(-Ad(h⁻¹) δ)
     return r, np.concatenate([J_i, J_j], axis=2)
 

@@ -33,7 +33,7 @@ from graphslam.core.network import PoseNetwork
 from graphslam.graph.network import network_values
 from graphslam.solve.descent import SAME, descend_to_minimum
 from graphslam.solve.network.start import network_arrays
-from graphslam.solve.sparse import SparseProblem, factorise_sparse
+from graphslam.solve.sparse import MANY, BlockElimination, SparseProblem, factorise_sparse
 
 Verdict = Literal["certified", "not certified", "not known"]
 # S counts as positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
@@ -108,14 +108,14 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
         return Certificate("not known", "descent of the relaxed objective did not end", relaxed_objective=value)
     scale = float(np.median(Q.diagonal()))
     S = sp.csc_matrix(dual_matrix(A, X) / scale)
-    negative = _negative_pivots(S + TOLERANCE * sp.identity(S.shape[0], format="csc"))
+    negative = _negative_pivots(S + TOLERANCE * sp.identity(S.shape[0], format="csc"), network.dim)
     lowest = float("nan")
     if eigenvalue:
         lowest = smallest_eigenvalue(S) if negative else _least_bound(S)
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
     problem = SparseProblem(network_arrays(network))
-    back = descend_to_minimum(problem, network_values(network, _poses_of(X, network))).objective
+    back = descend_to_minimum(problem, network_values(network, _poses_of(X, network)), predict=True).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)
     word = "lower" if back < objective else "higher"
@@ -198,6 +198,8 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
     t, R = (a.copy() for a in _matrices(network, poses))
     value = float(np.sum((A @ _stack(t, R)) ** 2))
     damping, eye = 0.0, sp.identity(n * d - d, format="csc")
+    blocks: BlockElimination | None = None
+    before = 0.0
     for _ in range(STEPS):
         Y = _stack(t, R)
         S = dual_matrix(A, Y)
@@ -205,9 +207,12 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
         D = _directions(R, basis)[:, d:]
         gradient = D.T @ np.asarray(A.T @ (A @ Y)).T.reshape(-1)
         H = sp.csc_matrix(D.T @ (sp.block_diag([S] * p, format="csr") @ D))
+        if n > MANY[p] and blocks is None:
+            blocks = BlockElimination(H, d)
+        factorise = factorise_sparse if blocks is None else blocks.factor
         while True:
             try:
-                step = factorise_sparse(sp.csc_matrix(H + damping * eye)).solve(-gradient)
+                step = factorise(sp.csc_matrix(H + damping * eye)).solve(-gradient)
             except RuntimeError:
                 step = np.full(len(gradient), np.nan)
             fall = -float(gradient @ step)
@@ -222,8 +227,11 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
                 return _stack(t, R), value, False
         if fresh <= value:
             t, R, value = moved_t, moved_R, fresh
-        if fall <= FALL * max(value, 1e-300) and damping == 0.0:
+        # convergence is at least as fast as before, so the next decrease is below fall² / before
+        rate = min(fall / before, 1.0) if before else 1.0
+        if damping == 0.0 and fall * rate <= FALL * max(value, 1e-300):
             return _stack(t, R), value, True
+        before = fall if damping == 0.0 else 0.0
         damping = 0.0 if damping < 1e-5 * float(np.median(np.abs(H.diagonal()))) else 0.1 * damping
     return _stack(t, R), value, False
 
@@ -270,11 +278,18 @@ def dual_matrix(A: sp.csr_matrix, X: Array) -> sp.csr_matrix:
     return sp.csr_matrix(A.T @ A - sp.csr_matrix((L.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)))
 
 
-def _negative_pivots(S: sp.csc_matrix) -> int:
+def _negative_pivots(S: sp.csc_matrix, p: int) -> int:
     """Negative eigenvalues, by the signs of the pivots of ``L D Lᵀ`` (Sylvester's law of inertia).
 
     SuperLU's symmetric mode without pivoting is that factorisation; if it pivoted, the matrix is not positive definite.
+    Of many poses it is only needed if there is no Cholesky factor.
     """
+    try:
+        if S.shape[0] > MANY[p] * (p + 1):
+            BlockElimination(S, p + 1).factor(S)
+            return 0
+    except RuntimeError:
+        pass
     try:
         lu = factorise_sparse(S)
     except RuntimeError:
