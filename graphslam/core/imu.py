@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
-from graphslam.core.records import check_times
+from graphslam.core.records import RowStream, check_times
 
 GRAVITY = 9.80665
 
@@ -44,7 +43,7 @@ class ImuNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Imu:
+class Imu(RowStream):
     """Angular rates and specific forces.
 
     A planar IMU (yaw rate and two accelerations without gravity) has zero rates about x and y and zero forces along z
@@ -75,6 +74,7 @@ class Imu:
     100
     """
 
+    ROWS = ("times", "angular_rate", "specific_force", "attitude")
     times: Array
     angular_rate: Array
     specific_force: Array
@@ -101,13 +101,3 @@ class Imu:
     def planar(self) -> bool:
         """Whether it is a planar IMU (yaw rate, two accelerations without gravity)."""
         return not (np.any(self.angular_rate[:, :2]) or np.any(self.specific_force[:, 2]))
-
-    def take(self, index: Any) -> Imu:
-        """See :class:`graphslam.core.records.Stream`."""
-        return replace(
-            self,
-            times=self.times[index],
-            angular_rate=self.angular_rate[index],
-            specific_force=self.specific_force[index],
-            attitude=None if self.attitude is None else self.attitude[index],
-        )

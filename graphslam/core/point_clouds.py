@@ -7,7 +7,7 @@ gives the points of one scan at a time, and an index into it, so that slicing a 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
-from graphslam.core.records import check_times
+from graphslam.core.records import RowStream, check_times
 
 
 class CloudSource(Protocol):
@@ -113,7 +113,7 @@ def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointClouds:
+class PointClouds(RowStream):
     """Scans of a 3-D lidar.
 
     Parameters
@@ -134,6 +134,7 @@ class PointClouds:
     2
     """
 
+    ROWS = ("times", "index")
     times: Array
     source: CloudSource
     index: npt.NDArray[np.int64] | None = None
@@ -178,8 +179,3 @@ class PointClouds:
 
     def __iter__(self) -> Iterator[Array]:
         return (self.cloud(k) for k in range(len(self)))
-
-    def take(self, index: Any) -> PointClouds:
-        """See :class:`graphslam.core.records.Stream`; no point is read."""
-        assert self.index is not None
-        return replace(self, times=self.times[index], index=self.index[index])

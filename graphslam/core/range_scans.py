@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,12 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
-from graphslam.core.records import check_times
+from graphslam.core.records import RowStream, check_times
 from graphslam.core.se3 import quat_multiply, quat_rotate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RangeScans:
+class RangeScans(RowStream):
     """Scans of one scanner.
 
     Beam j of scan k is emitted at ``times[k] + beam_times[j]``, with the head at the angle
@@ -51,6 +51,7 @@ class RangeScans:
     (1, 2)
     """
 
+    ROWS = ("times", "ranges", "spin", "spin_rate")
     times: Array
     ranges: npt.NDArray[np.floating[Any]]
     directions: Array
@@ -85,18 +86,6 @@ class RangeScans:
         for name in ("max_range", "sigma"):
             if not (finite_mask(getattr(self, name)) and getattr(self, name) > 0):
                 raise DataError(f"{name} is impossible", got=getattr(self, name), wanted="> 0 m")
-
-    def take(self, index: Any) -> RangeScans:
-        """See :class:`graphslam.core.records.Stream`."""
-        assert self.spin is not None
-        assert self.spin_rate is not None
-        return replace(
-            self,
-            times=self.times[index],
-            ranges=self.ranges[index],
-            spin=self.spin[index],
-            spin_rate=self.spin_rate[index],
-        )
 
     def beam_directions(self, record: Any, beam: Any) -> Array:
         """Unit directions ``(..., 3)`` of beams ``beam`` of scans ``record`` (broadcast), base frame at their own time.

@@ -8,7 +8,7 @@ bad records with :meth:`graphslam.core.log.DropCounter.drop` *before* they make 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,19 @@ class Stream(Protocol):
     def take(self, index: Any) -> Self:
         """The records ``index`` (slice, mask or integer array) as a stream of the same kind."""
         ...
+
+
+class RowStream:
+    """A stream whose fields :attr:`ROWS` have one row for each stamp, or are None."""
+
+    __slots__ = ()
+    ROWS: ClassVar[tuple[str, ...]]
+
+    def take(self, index: Any) -> Self:
+        """See :class:`Stream`."""
+        columns = {name: getattr(self, name) for name in self.ROWS}
+        stream: Any = self
+        return replace(stream, **{name: a if a is None else a[index] for name, a in columns.items()})
 
 
 PLAIN: dict[str, type[Any]] = {}
@@ -83,8 +96,16 @@ def _finite(a: Array, name: str) -> Array:
     return a
 
 
+def _positive(sigma: Any, n: int, what: str, unit: str) -> Array:
+    a = _finite(_array(sigma, (n,), "sigma"), "sigma")
+    if np.any(a <= 0):
+        k = int(np.flatnonzero(a <= 0)[0])
+        raise DataError(f"sigma of {what} {k} is not positive", got=a[k], wanted=f"> 0 {unit}")
+    return a
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LaserScans:
+class LaserScans(RowStream):
     """Planar laser scans.
 
     Parameters
@@ -108,6 +129,7 @@ class LaserScans:
     (1, 181)
     """
 
+    ROWS = ("times", "ranges")
     times: Array
     ranges: npt.NDArray[np.floating[Any]]
     bearings: Array
@@ -118,10 +140,6 @@ class LaserScans:
         object.__setattr__(self, "times", check_times(self.times, len(self.ranges)))
         object.__setattr__(self, "bearings", check_times(self.bearings, self.ranges.shape[1], where="beam bearings"))
         object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
-
-    def take(self, index: Any) -> LaserScans:
-        """See :class:`Stream`."""
-        return replace(self, times=self.times[index], ranges=self.ranges[index])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +172,7 @@ class AckermannGeometry:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringControls:
+class SteeringControls(RowStream):
     """Speed and steering of a car-like vehicle, held constant from each stamp to the next (zero-order hold).
 
     Parameters
@@ -177,6 +195,7 @@ class SteeringControls:
     array([2., 2.])
     """
 
+    ROWS = ("times", "speed", "steering")
     times: Array
     speed: Array
     steering: Array
@@ -188,14 +207,10 @@ class SteeringControls:
         for name in ("speed", "steering"):
             object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
 
-    def take(self, index: Any) -> SteeringControls:
-        """See :class:`Stream`."""
-        return replace(self, times=self.times[index], speed=self.speed[index], steering=self.steering[index])
-
 
 @plain_record("velocity-controls")
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityControls:
+class VelocityControls(RowStream):
     """Speed and yaw rate of a base that moves along its own x axis, held from each stamp to the next (zero-order hold).
 
     Commanded or measured; without a covariance, as :class:`SteeringControls`: the noise is part of the front end's
@@ -216,6 +231,7 @@ class VelocityControls:
     array([1.])
     """
 
+    ROWS = ("times", "speed", "yaw_rate")
     times: Array
     speed: Array
     yaw_rate: Array
@@ -226,13 +242,9 @@ class VelocityControls:
         for name in ("speed", "yaw_rate"):
             object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
 
-    def take(self, index: Any) -> VelocityControls:
-        """See :class:`Stream`."""
-        return replace(self, times=self.times[index], speed=self.speed[index], yaw_rate=self.yaw_rate[index])
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Odometry:
+class Odometry(RowStream):
     """Motion between stamps: record k is ``T_body(k-1)_body(k)``; record 0 is identity.
 
     Parameters
@@ -251,6 +263,7 @@ class Odometry:
     array([0.5, 0. , 0.1])
     """
 
+    ROWS = ("times", "increments", "covariances")
     times: Array
     increments: Array
     covariances: Array
@@ -264,15 +277,9 @@ class Odometry:
             self, "covariances", _finite(_array(self.covariances, (n, d, d), "covariances"), "covariance")
         )
 
-    def take(self, index: Any) -> Odometry:
-        """See :class:`Stream`."""
-        return replace(
-            self, times=self.times[index], increments=self.increments[index], covariances=self.covariances[index]
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gps:
+class Gps(RowStream):
     """Position fixes in a local metric frame (x east, y north[, z up]).
 
     Parameters
@@ -293,6 +300,7 @@ class Gps:
     array([0., 2.])
     """
 
+    ROWS = ("times", "positions", "sigma", "covariances")
     times: Array
     positions: Array
     sigma: Array
@@ -303,11 +311,8 @@ class Gps:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
         object.__setattr__(self, "positions", _finite(_array(self.positions, (n, -1), "positions"), "position"))
-        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
+        object.__setattr__(self, "sigma", _positive(self.sigma, n, "GPS record", "m"))
         object.__setattr__(self, "lever", _array(self.lever, (self.positions.shape[1],), "lever"))
-        if np.any(self.sigma <= 0):
-            k = int(np.flatnonzero(self.sigma <= 0)[0])
-            raise DataError(f"GPS sigma of record {k} is not positive", got=self.sigma[k], wanted="> 0 m")
         if self.covariances is not None:
             c = self.positions.shape[1]
             P = _finite(_array(self.covariances, (n, c, c), "covariances"), "GPS covariance")
@@ -339,13 +344,6 @@ class Gps:
         P = np.stack([h, h, v], axis=-1)[:, :, None] ** 2 * np.eye(3)
         return cls(times=times, positions=positions, sigma=h.copy(), lever=lever, covariances=P)
 
-    def take(self, index: Any) -> Gps:
-        """See :class:`Stream`."""
-        P = None if self.covariances is None else self.covariances[index]
-        return replace(
-            self, times=self.times[index], positions=self.positions[index], sigma=self.sigma[index], covariances=P
-        )
-
     def with_sigma(self, sigma: float | None) -> Gps:
         """The same fixes with one standard deviation for all coordinates [m]; None: unchanged."""
         return self if sigma is None else replace(self, sigma=np.full(len(self.times), sigma), covariances=None)
@@ -360,7 +358,7 @@ class Gps:
 
 @plain_record("compass")
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Compass:
+class Compass(RowStream):
     """Headings of a magnetic compass.
 
     Parameters
@@ -373,6 +371,7 @@ class Compass:
         Standard deviation [rad].
     """
 
+    ROWS = ("times", "headings", "sigma")
     times: Array
     headings: Array
     sigma: Array
@@ -381,19 +380,12 @@ class Compass:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
         object.__setattr__(self, "headings", _finite(_array(self.headings, (n,), "headings"), "heading"))
-        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
-        if np.any(self.sigma <= 0):
-            k = int(np.flatnonzero(self.sigma <= 0)[0])
-            raise DataError(f"sigma of compass reading {k} is not positive", got=self.sigma[k], wanted="> 0 rad")
-
-    def take(self, index: Any) -> Compass:
-        """See :class:`Stream`."""
-        return replace(self, times=self.times[index], headings=self.headings[index], sigma=self.sigma[index])
+        object.__setattr__(self, "sigma", _positive(self.sigma, n, "compass reading", "rad"))
 
 
 @plain_record("barometer")
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Barometer:
+class Barometer(RowStream):
     """Barometric heights of the body, relative to an unknown level.
 
     Parameters
@@ -405,6 +397,7 @@ class Barometer:
         Standard deviation [m]; the level is constant in a log, so σ includes changes of the weather.
     """
 
+    ROWS = ("times", "heights", "sigma")
     times: Array
     heights: Array
     sigma: Array
@@ -413,14 +406,7 @@ class Barometer:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
         object.__setattr__(self, "heights", _finite(_array(self.heights, (n,), "heights"), "height"))
-        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
-        if np.any(self.sigma <= 0):
-            k = int(np.flatnonzero(self.sigma <= 0)[0])
-            raise DataError(f"sigma of barometer reading {k} is not positive", got=self.sigma[k], wanted="> 0 m")
-
-    def take(self, index: Any) -> Barometer:
-        """See :class:`Stream`."""
-        return replace(self, times=self.times[index], heights=self.heights[index], sigma=self.sigma[index])
+        object.__setattr__(self, "sigma", _positive(self.sigma, n, "barometer reading", "m"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
