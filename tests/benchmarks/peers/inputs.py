@@ -148,6 +148,11 @@ def numbers(folder: Path, case: str) -> None:
     (folder / "case.json").write_text(json.dumps(words))
 
 
+def name(folder: Path, case: str) -> None:
+    """The case by its name."""
+    (folder / "case.json").write_text(json.dumps([case]))
+
+
 def nothing(folder: Path, case: str) -> None:
     """No input."""
 

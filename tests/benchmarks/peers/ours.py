@@ -124,6 +124,36 @@ def planar(folder: Path, share: float) -> Measured:
     return lambda: (gs.run(log, progress=False), {})[1]
 
 
+def on_threads(folder: Path, threads: int) -> Measured:
+    """SegSLAM with 40 particles over 300 s, or the relaxation of a skeleton of 10⁵ poses."""
+    import graphslam as gs
+    from graphslam.skeleton.collapse import Collapse
+    from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
+    from graphslam_studies.sim.laps import LapsConfig, draw_laps
+
+    def skeleton(poses: int) -> Any:
+        world = draw_laps(LapsConfig(poses=poses))
+        collapse = Collapse(int(world.first[-1]))
+        for a, b in world.correspondences():
+            collapse.add(a, b)
+        return world.problem(collapse.landmarks()[0])
+
+    if json.loads((folder / "case.json").read_text())[0] == "relaxation":
+        config = RelaxConfig(threads=threads)
+        relax_skeleton(skeleton(600), config)  # kernels
+        problem = skeleton(100_000)
+        return lambda: {"steps": len(relax_skeleton(problem, config).history)}
+    log = gs.simulate("mine", seed=2)
+    begin = log.interval[0]
+
+    def run(seconds: float) -> Any:
+        config = {"frontend": {"filter": {"particles": 40, "threads": threads}}}
+        return gs.run(log.slice(begin, begin + seconds), frontend="segslam", config=config, progress=False)
+
+    run(20.0)  # kernels
+    return lambda: {"submaps": len(run(300.0).submaps)}
+
+
 def chain(folder: Path) -> tuple[int, tuple[np.ndarray, ...]]:
     """Number of nodes, and the arrays of an open chain with fixes."""
     from tests.benchmarks import bench_incremental
@@ -315,6 +345,8 @@ WORKS: dict[str, Work] = {
     "second-run": compiled_run,
     "planar": lambda folder: planar(folder, 1.0),
     "planar-half": lambda folder: planar(folder, 0.5),
+    "two-threads": lambda folder: on_threads(folder, 2),
+    "one-thread": lambda folder: on_threads(folder, 1),
     "isam2": isam2,
     "isam2-gtsam": isam2_gtsam,
     "join-isam2": lambda folder: joined(folder, "isam2"),
