@@ -12,7 +12,8 @@ import numpy as np
 
 from graphslam.core import geometry as se2
 from graphslam.core.geometry import Array
-from graphslam.registration.target import Target
+from graphslam.registration.plane_kernels import line_alignment
+from graphslam.registration.target import FLATNESS, Target
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +44,9 @@ def linearise_alignment(source: Target, target: Target, T: Array, radius: float)
     ``e = ½ Σ dᵀ M d`` with ``d = T p - q`` and ``M = (C_q + R C_p Rᵀ)⁻¹``; ``M`` is constant.
     """
     moved = se2.se2_transform(T, source.points)
-    distance, which = target.tree.query(moved, distance_upper_bound=radius)
-    paired = np.flatnonzero(np.isfinite(distance))
-    if not len(paired):
-        return np.zeros((3, 3)), np.zeros(3), 0.0, 0
-    R, which = se2.rotation2(T[2]), which[paired]
-    M = np.linalg.inv(target.covariances[which] + R @ source.covariances[paired] @ R.T)
-    d = moved[paired] - target.points[which]
-    p = source.points[paired]
-    J = np.empty((len(p), 2, 3))
-    J[:, :, :2] = R
-    J[:, :, 2] = np.stack([-p[:, 1], p[:, 0]], 1) @ R.T  # d(R Exp(δ) p)/dδ = R p⊥
-    MJ = M @ J
-    H = np.einsum("mki,mkj->ij", J, MJ)
-    b = np.einsum("mki,mk->i", MJ, d)
-    return H, b, 0.5 * float(np.einsum("mi,mij,mj->", d, M, d)), len(paired)
+    _, which = target.tree.query(moved, distance_upper_bound=radius)
+    lines = (source.points, source.lines[0], target.points, target.lines[0])
+    return line_alignment(*lines, T, which, FLATNESS)
 
 
 def align_planar(

@@ -414,3 +414,36 @@ def plane_blocks(
                 H[b + u * w + v] += Lv * Jj[v]
                 H[c + u * w + v] += Lv * Ji[v] if low_is_j else Lu * Jj[v]
     return total
+
+
+@njit
+def line_alignment(
+    source: Array, source_normals: Array, target: Array, target_normals: Array, T: Array, which: Index, flatness: float
+) -> tuple[Array, Array, float, int]:
+    """Hessian ``(3, 3)``, gradient ``(3,)``, ``½ Σ dᵀ M d`` and number of pairs of planar points at ``T`` ``(3,)``.
+
+    ``which`` ``(n,)`` are rows of target points; a row after the last is no pair. The shape of a point of normal n
+    is ``I - (1 - flatness) n nᵀ``; M is the inverse of the sum of both shapes.
+    """
+    H, b, error, pairs = np.zeros((3, 3)), np.zeros(3), 0.0, 0
+    c, s, flat = np.cos(T[2]), np.sin(T[2]), 1.0 - flatness
+    for k in range(len(source)):
+        q = which[k]
+        if q >= len(target):
+            continue
+        pairs += 1
+        x, y = c * source[k, 0] - s * source[k, 1], s * source[k, 0] + c * source[k, 1]
+        dx, dy = x + T[0] - target[q, 0], y + T[1] - target[q, 1]
+        mx = c * source_normals[k, 0] - s * source_normals[k, 1]
+        my = s * source_normals[k, 0] + c * source_normals[k, 1]
+        nx, ny = target_normals[q, 0], target_normals[q, 1]
+        xx, xy, yy = 2.0 - flat * (nx * nx + mx * mx), -flat * (nx * ny + mx * my), 2.0 - flat * (ny * ny + my * my)
+        det = xx * yy - xy * xy
+        for i, (u, v) in enumerate(((c, s), (-s, c), (-y, x))):  # columns of d(R Exp(δ) p)/dδ
+            mu, mv = (yy * u - xy * v) / det, (xx * v - xy * u) / det
+            b[i] += mu * dx + mv * dy
+            H[i, 0] += mu * c + mv * s
+            H[i, 1] += mv * c - mu * s
+            H[i, 2] += mv * x - mu * y
+        error += 0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
+    return H, b, error, pairs

@@ -75,14 +75,6 @@ class Target:
         small_gicp.estimate_covariances(cloud, tree, self.neighbours)
         return cloud, tree
 
-    @cached_property
-    def covariances(self) -> Array:
-        """Shapes ``(m, 2, 2)`` in 2-D: variance 1 along the line through the neighbours of a point, :data:`FLATNESS`
-        across it; the unit matrix with fewer than 5 points.
-        """
-        normals, _ = self.normals(np.arange(len(self)))
-        return flat_shapes(normals)
-
     def normals(self, rows: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normals of given points with their noise covariances.
 
@@ -99,7 +91,7 @@ class Target:
             Computed lazily.
         """
         if self.dim == 2:
-            return self._lines[0][rows], self._lines[1][rows]
+            return self.lines[0][rows], self.lines[1][rows]
         known, normals, noise = self._normals
         new = np.unique(rows[~known[rows]])
         n = min(self.neighbours, len(self))
@@ -120,7 +112,7 @@ class Target:
         return np.maximum(spread, 1e-12 * np.maximum(spread[:, -1:], 1e-300)), axes
 
     @cached_property
-    def _lines(self) -> tuple[Array, Array]:
+    def lines(self) -> tuple[Array, Array]:
         """2-D normals and their noise.
 
         In sparse parts of a scan (far in a corridor, at a corner) the neighbours of a point can be on two walls. A line

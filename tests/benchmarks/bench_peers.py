@@ -5,14 +5,14 @@
 does the same.
 
 A peer is installed from the package registry into an environment of its own below ``build/peers``; one that cannot be
-installed is printed as such, with the reason. Each run is a process of its own on one core and with one thread, but for
-``two-cores``, whose ``elapsed`` [s] is by the clock: it needs two free cores. After a run that is not counted (kernels
-are compiled then), the two take turns. A line of the table is a figure: minimum, median and maximum of ours, of the peer
-and of the ratios of the turns, the ratio of the means, the goal, and whether the means meet it. ``work`` is CPU time
-without imports [s], ``cold`` that of a first call, ``whole`` that of the process, ``peak`` its memory [MB]. ``error`` is
-the ATE [m] (lidar, isam2), a distance [m] (register), an objective (join; solve beside g2o) or objective / best known -
-1 (solve beside GTSAM). Figures of isam2 are of single updates [ms CPU]: ``update`` the mean, ``with factors`` with
-``add_submap``, while GTSAM's factors are made outside the time.
+installed is printed as such, with the reason. Each run is a process of its own on one core and with one thread, but
+for ``two-cores``, whose ``elapsed`` [s] is by the clock: it needs two free cores. After a run that is not counted
+(kernels are compiled then), the two take turns. A line of the table is a figure: minimum, median and maximum of ours,
+of the peer and of the ratios of the turns, the ratio of the means, the goal, and whether the means meet it. ``work``
+is CPU time without imports [s], ``cold`` that of a first call, ``whole`` that of the process, ``peak`` its memory
+[MB]. ``error`` is the ATE [m] (lidar, isam2), a distance [m] (register), an objective (join; solve beside g2o) or
+objective / best known - 1 (solve beside GTSAM). Figures of isam2 are of single updates [ms CPU]: ``update`` the mean,
+``with factors`` with ``add_submap``, while GTSAM's factors are made outside the time.
 
 ``--quick`` installs nothing: small cases of peers that are in this environment.
 """

@@ -8,6 +8,7 @@ import small_gicp
 from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.geometry import Array
+from graphslam.registration.target import flat_shapes
 
 
 def slow_field(points: Array, low: Array, shape: tuple[int, ...], cell: float, sigma: float) -> Array:
@@ -81,11 +82,12 @@ def planar_error(source, target, T: Array, radius: float, T_weights: Array) -> f
     pairs as there.
     """
     R, total = se2.rotation2(T_weights[2]), 0.0
-    for p, C in zip(source.points, source.covariances):
+    own, other = (flat_shapes(t.normals(np.arange(len(t)))[0]) for t in (source, target))
+    for p, C in zip(source.points, own):
         at = se2.se2_transform(T_weights, p)
         distances = np.hypot(*(target.points - at).T)
         k = int(np.argmin(distances))
         if distances[k] < radius:
             d = se2.se2_transform(T, p) - target.points[k]
-            total += 0.5 * float(d @ np.linalg.inv(target.covariances[k] + R @ C @ R.T) @ d)
+            total += 0.5 * float(d @ np.linalg.inv(other[k] + R @ C @ R.T) @ d)
     return total

@@ -82,11 +82,6 @@ class BarometerBatch(UniformBatch):
         """Node, level, tilt."""
         return record.node, record.baselevel, 0 if record.tilt else None
 
-    @staticmethod
-    def whitener(record: BarometerRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
-
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         x, level, tilt = blocks

@@ -218,8 +218,9 @@ class UniformBatch(FactorBatch):
 
     @staticmethod
     def whitener(record: Any) -> Array:
-        """``W`` ``(d, d)`` with ``Wᵀ W`` = information."""
-        return np.asarray(record.whitener)
+        """``W`` ``(d, d)`` with ``Wᵀ W`` = information: the record's ``whitener``, or ``I / sigma``."""
+        W = getattr(record, "whitener", None)
+        return np.eye(record.rows) / record.sigma if W is None else np.asarray(W)
 
     @abstractmethod
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

@@ -95,11 +95,6 @@ class CompassBatch(UniformBatch):
         """Node, zero, and deviation if it is estimated."""
         return record.node, record.compass, record.deviation
 
-    @staticmethod
-    def whitener(record: CompassRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
-
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         x, zero, deviation = blocks
@@ -166,11 +161,6 @@ class DeclinationBatch(UniformBatch):
         """Zero, datum."""
         return record.compass, 0
 
-    @staticmethod
-    def whitener(record: DeclinationRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
-
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`; the datum's heading is last."""
         zero, datum = blocks
@@ -214,11 +204,6 @@ class DeviationPriorBatch(UniformBatch):
     def keys(record: DeviationPriorRecord) -> Sequence[int | None]:
         """The deviation."""
         return (record.deviation,)
-
-    @staticmethod
-    def whitener(record: DeviationPriorRecord) -> Array:
-        """``I/σ``."""
-        return np.eye(2) / record.sigma
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""

@@ -203,11 +203,6 @@ class DistanceBatch(UniformBatch):
         r = record
         return r.node, r.landmark, r.point, r.node_to, r.landmark_to, r.point_to
 
-    @staticmethod
-    def whitener(record: DistanceRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
-
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         (p, J_p), (q, J_q) = self._ends[0].terms(*blocks[:3]), self._ends[1].terms(*blocks[3:])

@@ -137,11 +137,6 @@ class RangeBatch(UniformBatch):
         """Both nodes."""
         return record.i, record.j
 
-    @staticmethod
-    def whitener(record: RangeRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
-
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         (a, J_a), (b, J_b) = antennas(blocks[0], self._arm_i), antennas(blocks[1], self._arm_j)
@@ -165,11 +160,6 @@ class BeaconRangeBatch(UniformBatch):
     def keys(record: BeaconRangeRecord) -> Sequence[int | None]:
         """Node, beacon."""
         return record.node, record.beacon
-
-    @staticmethod
-    def whitener(record: BeaconRangeRecord) -> Array:
-        """``1/σ``."""
-        return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
