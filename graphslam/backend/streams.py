@@ -153,11 +153,12 @@ class ImuSource:
         if self.config.axes == "ignore" or not graph.submaps:
             return
         now = graph.submaps[-1].interval[1]
-        for name, imu in self.imus.items():
-            begin = max(float(imu.times[0]), graph.submaps[0].interval[0]) if len(imu.times) else np.inf
-            if name not in self._looked and now - begin >= CHECKED_AFTER:
+        for name in [n for n in self.feed.names(Imu) if n not in self._looked]:
+            times = self.feed.part(name, 0, 1).times
+            begin = max(float(times[0]), graph.submaps[0].interval[0]) if len(times) else np.inf
+            if now - begin >= CHECKED_AFTER:
                 self._looked.add(name)
-                ImuFactors.of(graph).check(imu, stream=name, axes=self.config.axes)
+                ImuFactors.of(graph).check(self.imus[name], stream=name, axes=self.config.axes)
 
     def attach(self, graph: FactorGraph, *, more: bool = False) -> int:
         """Add factors of the selected IMUs to the graph; returns the number of new factors.

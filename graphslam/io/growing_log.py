@@ -159,16 +159,19 @@ class _Held:
         self.parts.append(records)
         self.ends.append(self.ends[-1] + len(records.times))
         self.until = float(records.times[-1])
+        while self.spool is None and len(self.parts) > 1 and 2 * self.ends[-2] <= self.ends[-1] + self.ends[-3]:
+            self.parts[-2:] = [join_portions(self.kind, self.parts[-2:])]  # so there are only a few portions
+            del self.ends[-2]
 
     def part(self, first: int, last: int) -> Stream:
         if first < self.ends[0]:
             raise DataError("records that were already freed", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
             self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # merged once for later calls
-        a = bisect_right(self.ends, first) - 1
+        a = min(bisect_right(self.ends, first), len(self.parts)) - 1
         b = max(bisect_left(self.ends, last), a + 1)
-        here = self.parts[a] if b == a + 1 else join_portions(self.kind, self.parts[a:b])
-        return here.take(slice(first - self.ends[a], last - self.ends[a]))
+        here = [p.take(slice(max(first - e, 0), last - e)) for p, e in zip(self.parts[a:b], self.ends[a:b])]
+        return here[0] if len(here) == 1 else join_portions(self.kind, here)
 
     def discard_before(self, before: int) -> None:
         if self.spool is None:

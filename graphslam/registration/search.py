@@ -10,9 +10,9 @@ field, which takes a few tenths of a nanosecond per point and start.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,22 @@ from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima, score_block
 
 MOST_STARTS = 50_000_000
+SLICE = 30_000_000
+"""Points times starts of one slice of a search, some milliseconds."""
+SLICE_MODES = 16
+"""Modes that are refined in one slice."""
+
+V = TypeVar("V")
+
+
+def last_value(work: Generator[None, None, V]) -> V:
+    """Do all of the work; returns its result."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            value: V = end.value
+            return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +158,13 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
     -------
     (headings, z, y, x) uint32
     """
+    return last_value(_scoring(points, field, around, lattice))
+
+
+def _scoring(
+    points: Array, field: SearchField, around: Array, lattice: SearchLattice
+) -> Generator[None, None, npt.NDArray[np.uint32]]:
+    """:func:`score_lattice` in slices of some headings."""
     phases = field._in_phases(lattice.steps)
     scores = np.zeros(lattice.shape, np.uint32)
     first = np.array([lattice.x[0], lattice.y[0], lattice.z[0]])
@@ -151,7 +174,12 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
     still = np.zeros_like(lattice.yaw)
     turned = offset_pose(around, np.stack([still, still, still, lattice.yaw], -1))
     cells = field._cells(transform_points(turned[:, None], points).reshape(-1, field.dim)) + back
-    score_block(cells.reshape(len(turned), -1, 3), counts, steps, phases, scores)
+    cells = cells.reshape(len(turned), -1, 3)
+    size = max(1, int(SLICE // max(len(points) * counts.prod(), 1)))
+    for k in range(0, len(turned), size):
+        if k:
+            yield
+        score_block(cells[k : k + size], counts, steps, phases, scores[k : k + size])
     return scores
 
 
@@ -219,6 +247,21 @@ def correlative_search(
     -----
     Deterministic.
     """
+    return last_value(searching(source, field, around, half_widths, steps, keep, coarse=coarse, config=config))
+
+
+def searching(
+    source: Any,
+    field: SearchField,
+    around: Any,
+    half_widths: Sequence[float],
+    steps: Sequence[float] | None = None,
+    keep: int = 6,
+    *,
+    coarse: SearchField | None = None,
+    config: SearchConfig | None = None,
+) -> Generator[None, None, list[SearchStart]]:
+    """:func:`correlative_search` in slices of bounded work; the result is the same."""
     config = SearchConfig() if config is None else config
     T = check_pose(around, field.dim, what="pose to search around")
     p = finite_points(source, what="source points")
@@ -234,17 +277,19 @@ def correlative_search(
         return []
     if coarse is None:
         few, seen, modes = p, lattice, 4 * keep
-        sums = score_lattice(p, field, T, lattice)
+        sums = yield from _scoring(p, field, T, lattice)
     else:
         few, modes = evenly_spaced(p, config.coarse_points), max(config.coarse_modes, keep)
         seen = make_lattice(coarse, half_widths, step, reach)
-        sums = score_lattice(few, coarse, T, seen)
+        sums = yield from _scoring(few, coarse, T, seen)
+    yield
     scores = _shares(sums, len(few))
     scores[sums == 0] = -np.inf
     top = local_maxima(scores)
     places, score = seen.places(top), scores[tuple(top.T)]
     if config.refine or coarse is not None:
-        places, score = _refine(p, field, T, lattice, places[_distinct(places, score, modes, config)])
+        places = places[_distinct(places, score, modes, config)]
+        places, score = yield from _refine(p, field, T, lattice, places)
     starts = []
     for s in _distinct(places, score, keep, config):
         x, y, z, yaw = (float(v) for v in places[s])
@@ -259,7 +304,7 @@ def _shares(sums: npt.NDArray[np.uint32], points: int) -> npt.NDArray[np.float32
 
 def _refine(
     points: Array, field: SearchField, around: Array, lattice: SearchLattice, places: Array
-) -> tuple[Array, Array]:
+) -> Generator[None, None, tuple[Array, Array]]:
     """Best offsets within half a step of each of ``places (k, 4)``, with scores."""
     turn = lattice.yaw[1] - lattice.yaw[0] if len(lattice.yaw) > 1 else 0.0
     half: list[Array] = [
@@ -268,6 +313,8 @@ def _refine(
     near = SearchLattice(half[0], half[1], half[2], np.arange(-2, 3) * 0.25 * turn if turn else np.zeros(1))
     found, score = places.copy(), np.empty(len(places))
     for k, at in enumerate(places):
+        if k % SLICE_MODES == 0:
+            yield
         scores = _shares(score_lattice(points, field, offset_pose(around, at), near), len(points))
         best = np.unravel_index(int(np.argmax(scores)), scores.shape)
         found[k], score[k] = at + near.places(np.array([best]))[0], scores[best]

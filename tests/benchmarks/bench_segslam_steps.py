@@ -1,24 +1,36 @@
-"""Work of online SegSLAM for each step, over the mine: longest step, median, and growth with the map.
+"""Work of online SegSLAM, record by record over the mine: longest, median, and growth with the map.
 
-``python -m tests.benchmarks.bench_segslam_steps [--particles N] [--seconds S] [--world mine]``: CPU time of the steps
-of the filter (0.4 s of driving) and of their slices, the work between two records; by quarters of the path;
-memory of all maps along it. The mine
-needs `graphslam-studies`.
+``python -m tests.benchmarks.bench_segslam_steps [--particles N] [--seconds S] [--world mine]``: all records go to
+`gs.Slam`, which gives a pose after each scan. CPU time of its work between two scans and in the 0.4 s of a step (with
+steps, estimates, ends of submaps and the graph), and of the slices of the filter; by quarters of the path; memory of
+all maps along it. The mine needs `graphslam-studies`.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numpy as np
 
 import graphslam as gs
-from graphslam.app.run.options import RunOptions
+from graphslam.backend.back_end import Observer
 from graphslam.core.log import SensorLog
-from graphslam.core.random import SeedTree
-from graphslam.core.record_source import RecordSource
 from graphslam_frontends.segslam.front_end import SegSlam
+
+STEP = 0.4
+"""Of the filter [s]."""
+
+
+class Lags(Observer):
+    """Wants a pose after each scan."""
+
+    def __init__(self) -> None:
+        self.lags: list[float] = []
+
+    def pose_estimated(self, estimate: Any) -> None:
+        self.lags.append(estimate.lag)
 
 
 def log_of(world: str, seed: int, seconds: float) -> SensorLog:
@@ -48,21 +60,39 @@ def main() -> None:
     if a.quick:
         a.world, a.seconds, a.particles = "court", 30.0, 4
     log = log_of(a.world, a.seed, a.seconds)
-    asked = {"filter": {"particles": a.particles}, "steps": {"level_floors": False}}
-    front = RunOptions.for_log(log, "segslam", "isam2", a.seed, {"frontend": asked}).front
-    assert isinstance(front, SegSlam)
-    begin, steps, slices = time.process_time(), list[float](), list[float]()
-    maps = [(0, 0.0)]
-    for _ in front.follow(RecordSource(log), seed=SeedTree(a.seed)):
-        run = front._live[0].run
-        steps, slices = run.step_seconds, run.slice_seconds
-        maps.append((len(steps), run.filter.pool.used_bytes / 1e6))
+    asked = {"preset": a.world, "frontend": {"filter": {"particles": a.particles}, "steps": {"level_floors": False}}}
+    fed(log_of("court", 1, 20.0), a.seed, {"frontend": asked["frontend"]})  # compiles
+    begin = time.process_time()
+    times, work, scans, lags, front, maps = fed(log, a.seed, asked)
     print(f"{log.name}, {log.duration:.0f} s, {a.particles} particles: {time.process_time() - begin:.1f} CPU seconds")
-    table("steps", np.array(steps))
-    table("slices", np.array(slices))
-    at = np.linspace(0.0, len(steps), 9)[1:]
+    table("between scans", np.add.reduceat(work, scans))
+    table("steps of 0.4 s", np.bincount(((times - times[0]) / STEP).astype(int), work))
+    table("slices of the filter", np.array(front._live[0].run.slice_seconds))
+    print(f"lag: median {np.median(lags):.1f} s, longest {max(lags):.1f} s; {len(lags)} poses, {len(scans)} scans")
+    at = np.linspace(times[0], times[-1], 9)[1:]
     megabytes = np.interp(at, *np.array(maps).T)
     print("maps at the ends of the eighths [MB]:", *(f"{m:.1f}" for m in megabytes))
+
+
+def fed(log: SensorLog, seed: int, asked: dict[str, Any]) -> tuple[Any, ...]:
+    """Feed all records: their stamps and work [s], the numbers of those of scans, lags, front end, map memory."""
+    observer, work, times = Lags(), list[float](), list[float]()
+    scans, maps = list[int](), [(log.interval[0], 0.0)]
+    with gs.Slam("segslam", seed=seed, config=asked, observers=[observer]) as slam:
+        assert slam._slam is not None
+        front = slam._slam.options.front
+        assert isinstance(front, SegSlam)
+        for t, stream, k in log.events():
+            record = log[stream].take(slice(k, k + 1))
+            begin = time.process_time()
+            slam.add(record, stream)
+            work.append(time.process_time() - begin)
+            times.append(t)
+            if isinstance(log[stream], (gs.RangeScans, gs.PointClouds, gs.LaserScans)):
+                scans.append(len(work) - 1)
+                if front._live and len(scans) % 100 == 0:
+                    maps.append((t, front._live[0].run.filter.pool.used_bytes / 1e6))
+    return np.array(times), np.array(work), scans, observer.lags, front, maps
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import pytest
 from graphslam.core.errors import DataError, FormatError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.records import VelocityControls
 from graphslam.io.growing_log import BEAMS, GrowingLog
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_kinds import stream_kinds
@@ -56,6 +57,18 @@ def test_parts_are_those_of_the_whole(log: SensorLog, tmp_path: Path) -> None:
             got, kind = growing.part(name, a, b), next(k for k in stream_kinds().values() if k.cls is type(stream))
             for x, y in zip(kind.arrays(got).values(), kind.arrays(stream.take(slice(a, b))).values(), strict=True):
                 np.testing.assert_array_equal(x, y)
+
+
+def test_single_records_are_joined_to_a_few_portions(tmp_path: Path) -> None:
+    growing = GrowingLog("odometry", tmp_path)
+    whole = VelocityControls(times=np.arange(300.0), speed=np.arange(300.0), yaw_rate=np.zeros(300))
+    for k in range(300):
+        growing.add("wheels", whole.take(slice(k, k + 1)))
+        held = growing._held["wheels"]
+        assert len(held.parts) <= np.log2(k + 1) + 1
+        part = growing.part("wheels", max(k - 20, 0), k + 1)
+        assert part.speed.tobytes() == whole.speed[max(k - 20, 0) : k + 1].tobytes()
+    assert len(growing.part("wheels", 300).times) == 0
 
 
 def test_only_beams_are_let_go_of_and_asking_for_them_is_an_error(log: SensorLog, tmp_path: Path) -> None:

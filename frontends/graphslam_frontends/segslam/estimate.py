@@ -49,17 +49,21 @@ class PoseEstimator:
         self.committed = 0
         """Number of submaps that were output."""
         self._base: tuple[Any, Link] = (None, (0, np.zeros(0), np.zeros(0)))
+        self._reckoned: tuple[Any, Link] = self._base
 
     def now(self) -> PoseEstimate:
         """The pose at the last record of the motion."""
         g, run, steps = self.run.segmap.group, self.run, self.steps
-        link = self._to_segment()
-        if all(e is not None for e in run.segmap.entries):
-            link = self._in_segment(link)
         k, made = run.at, steps.made - 1
-        anchor, T, C = link
-        if made > k:  # dead reckoning over the look-ahead
-            T, C = _compose(g, T, C, *steps.all_errors().between(k, made))
+        key = k, made, len(run.boundaries), self.committed
+        if self._reckoned[0] != key:
+            link = self._to_segment()
+            if all(e is not None for e in run.segmap.entries):
+                link = self._in_segment(link)
+            if made > k:  # dead reckoning over the look-ahead
+                link = link[0], *_compose(g, link[1], link[2], *steps.all_errors().between(k, made))
+            self._reckoned = key, link
+        anchor, T, C = self._reckoned[1]
         more = steps.motion_to_now()
         if more is not None:
             T, C = _compose(g, T, C, *more[1:])

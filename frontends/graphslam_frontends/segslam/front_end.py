@@ -52,6 +52,9 @@ DELAY = 2.0
 """A step is filtered this long after its look-ahead window, so that steps that are made together are filtered evenly
 [s]."""
 
+PAUSE = 0.04
+"""Between records there is one slice of work per this time of the log [s]."""
+
 
 @dataclass(frozen=True, slots=True)
 class SegSlam(StepwiseFrontEnd):
@@ -94,16 +97,19 @@ class SegSlam(StepwiseFrontEnd):
         for found in self._filtered(feed, seed, drops, watch):
             new: list[Submap] = []
             if isinstance(found, SegSlamFilter) and found.closed[0] < 0 and (found.boundary or found.resampled[-1]):
+                yield from _pause(feed)
                 new = _submaps_until(found, found.common(), self.config.drift, self.config.segslam, key)
             elif isinstance(found, SegSlamResult):
                 new = submaps_of_best_particle(found, self.config.drift, self.config.segslam, after=key)
                 new[-1] = with_findings(new[-1], found.steps)
             for submap in new:
+                yield from _pause(feed)
                 key = submap.key
                 for estimator in self._live:
                     estimator.committed = key + 1
                 if key >= first:
                     yield submap
+                    yield from _pause(feed)
             if found is None:
                 yield None
 
@@ -131,12 +137,13 @@ class SegSlam(StepwiseFrontEnd):
         c, filter, growing = self.config, self.config.filter, GrowingSteps(feed, self.config.steps)
         number = len(self.steps(feed.log, drops=drops)) if feed.ended else 0  # errors of the log, before the work
         run: SegSlamFilter | None = None
-        window, k = c.segslam.segmentation.window, 0
+        window, k, seen, busy = c.segslam.segmentation.window, 0, -np.inf, -np.inf
         while not (self.waits_for() or growing.whole_log):
             while not growing.cover(k, window) and growing.more():
                 pass
             due = growing.latest >= growing.times[k] + window + DELAY if growing.cover(k, window) else growing.complete
-            if not (feed.ended or due):
+            if not (feed.ended or (due and growing.latest >= busy)):
+                seen = growing.latest
                 yield None
                 continue
             if growing.complete and (k >= growing.made or growing.made < 2):
@@ -147,8 +154,12 @@ class SegSlam(StepwiseFrontEnd):
                 run = SegSlamFilter(growing, filter, c.segslam, seed.child(0), 32)
             run.grow()
             for _ in run.slices(k, last=growing.complete and k == growing.made - 1):
-                if not feed.ended:
-                    yield None  # the rest of the step with the next records
+                busy = max(busy, seen) + PAUSE
+                while not feed.ended and growing.latest < busy:  # the rest of the step with the next records
+                    seen = growing.latest
+                    yield None
+                    growing.more()
+            busy = max(busy, seen) + PAUSE
             growing.forget_before(k + 1)
             if not self._live:
                 self._live.append(PoseEstimator(run, growing, c.drift, c.segslam.handover.drift_scale))
@@ -168,6 +179,13 @@ class SegSlam(StepwiseFrontEnd):
             # one path for all: its uncertainty is too small for maps to resolve
             steps, filter = odometry_from_scans(steps, c.window), replace(filter, walk_scale=0.0, motion_scale=0.0)
         yield run_segslam(steps, filter, c.segslam, seed.child(0), watch=watch)
+
+
+def _pause(feed: RecordSource) -> Iterator[None]:
+    """Wait for the records of the next scan: the parts of the work for a submap are not done together."""
+    begin = max((feed.until(n) for n in feed.names(object)), default=0.0)
+    while not feed.ended and max(feed.until(n) for n in feed.names(object)) < begin + 3.0 * PAUSE:
+        yield None
 
 
 def submaps_of_best_particle(

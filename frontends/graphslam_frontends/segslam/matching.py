@@ -19,8 +19,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
 from graphslam.registration.config import LEAST_POINTS
-from graphslam.registration.register import Registration, distinct_registrations, register_starts
-from graphslam.registration.search import correlative_search
+from graphslam.registration.register import Registration, distinct_registrations, register
+from graphslam.registration.search import last_value, searching
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam_frontends.segslam.candidate_selection import CandidateSelection, SegmentCandidates, select_candidates
@@ -47,19 +47,11 @@ CLOUD_LEVEL = 1
 """The occupied voxels of a map are averaged for matching in cells of 2**level voxels."""
 SAME_START = 1.0
 """Particles with the same map and predictions closer than about this share one search [m]."""
+SLICE_PARTICLES = 5
+"""Particles whose candidates are selected or judged in one slice."""
 RIVALS = 0.15
 """In the maps of other particles of the same steps only those modes are tried that in the first map were worse by at
 most this share of the points, or by ``choice.margin`` if that is larger, so that second modes are not missed."""
-
-
-def last_value(work: Generator[None, None, V]) -> V:
-    """Do all of the work; returns its result."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            value: V = end.value
-            return value
 
 
 class RecentCache(dict[K, V]):
@@ -153,10 +145,8 @@ class Matcher:
         self.winnowed = CandidateSelection()
         # registration targets of closed maps, made at first use
         self._targets: RecentCache[int, Target | None] = RecentCache(lambda t: 0 if t is None else POINT_BYTES * len(t))
-        # fine and coarse, of one map of all particles' maps of the same steps
-        self._fields: RecentCache[tuple[int, int], tuple[SearchField, SearchField]] = RecentCache(
-            lambda pair: pair[0].nbytes + pair[1].nbytes
-        )
+        # fine (1) and coarse (2), of one map of all particles' maps of the same steps
+        self._fields: RecentCache[tuple[int, int, int], SearchField] = RecentCache(lambda field: field.nbytes)
 
     def attempt(self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree) -> MatchAttempt:
         """Try to match all particles, and draw.
@@ -175,7 +165,7 @@ class Matcher:
     def attempting(
         self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree
     ) -> Generator[None, None, MatchAttempt]:
-        """:meth:`attempt` in slices of bounded work, one search or registration each; the result is the same."""
+        """:meth:`attempt` in slices of bounded work; the result is the same."""
         nothing = MatchAttempt(step=step, entries=(None,) * len(poses))
         segmap, config = self.segmap, self.config
         alive = segmap.alive
@@ -185,12 +175,17 @@ class Matcher:
         source = ahead.source(config.search.source_points, config.search.source_radius)
         if len(source) < LEAST_POINTS:
             return nothing
-        asked = self._candidates(step, poses, seed)
+        yield
+        asked = yield from self._candidates(step, poses, seed)
         if not any(map(len, asked)):
             return nothing
         results, searches, registrations = yield from self._register(source, asked)
-        proposals = [self._proposals(c, results, ahead, seed.child("localise", i)) for i, c in enumerate(asked)]
-        judged = [match_posterior(p, config.choice, config.registration) for p in proposals]
+        judged = []
+        for i, c in enumerate(asked):
+            if i % SLICE_PARTICLES == 0 or config.choice.method != "registration":
+                yield
+            proposals = self._proposals(c, results, ahead, seed.child("localise", i))
+            judged.append(match_posterior(proposals, config.choice, config.registration))
         uniform = seed.child("draw").generator().random(len(poses))
         entries: list[SegmentEntry | None] = []
         why: Counter[str] = Counter()
@@ -212,7 +207,7 @@ class Matcher:
 
     # --- candidates ------------------------------------------------------------------------------------------
 
-    def _candidates(self, step: int, poses: Array, seed: SeedTree) -> list[SegmentCandidates]:
+    def _candidates(self, step: int, poses: Array, seed: SeedTree) -> Generator[None, None, list[SegmentCandidates]]:
         """Candidates of each particle. Particles with the same history share a map sample."""
         segmap, config = self.segmap, self.config
         groups: dict[tuple[int, int, int], list[int]] = {}
@@ -227,10 +222,14 @@ class Matcher:
             )  # fmt: skip
             entry = segmap.entries[members[0]]
             held = self._held(-1 if entry is None or entry.kind == NEW else entry.source)
-            found = select_candidates(
-                segmap, sample, poses[members], step, config.winnowing, exclude=held, tally=self.winnowed
-            )  # fmt: skip
-            out.update(zip(members, found))
+            for k in range(0, len(members), SLICE_PARTICLES):
+                some = members[k : k + SLICE_PARTICLES]
+                found = select_candidates(
+                    segmap, sample, poses[some], step, config.winnowing, exclude=held, tally=self.winnowed
+                )  # fmt: skip
+                out.update(zip(some, found))
+                if len(out) // SLICE_PARTICLES > (len(out) - len(some)) // SLICE_PARTICLES:
+                    yield
         return [out[i] for i in range(len(poses))]
 
     def _held(self, source: int) -> frozenset[int]:
@@ -266,6 +265,7 @@ class Matcher:
                 if target is None:
                     continue
                 done.add(key)
+                yield
                 cloud = Target(source, neighbours=target.neighbours) if cloud is None else cloud
                 radius = min(s.max_radius, 2.5 * float(sigma))
                 # maps that begin at one step share a start pose: the modes of the first are starts in the others
@@ -274,10 +274,14 @@ class Matcher:
                 first = starts is None
                 if starts is None:
                     height = [] if planar else [s.height + self.config.winnowing.rise(float(length))]
-                    starts = self._search(source, segment, T, [radius, radius, *height, s.yaw_width(float(length))])
+                    half = [radius, radius, *height, s.yaw_width(float(length))]
+                    starts = yield from self._search(source, segment, T, half)
                     searches += 1
+                found = []
+                for start in starts:
                     yield
-                found = register_starts(cloud, target, starts, rules)
+                    found.append(register(cloud, target, start, rules))
+                found = distinct_registrations(found)
                 registrations += len(starts)
                 if first:
                     top = found[0].best_fitness if found else 0.0
@@ -307,21 +311,21 @@ class Matcher:
 
         return self._targets.of(m, made)
 
-    def _search(self, source: Array, segment: int, T: Array, half: list[float]) -> list[Array]:
+    def _search(self, source: Array, segment: int, T: Array, half: list[float]) -> Generator[None, None, list[Array]]:
         """Starts for registration: the best distinct modes, if any score is high enough."""
         s = self.config.search
         known = (self._begin(segment), int(self.segmap.table.end[segment]))
 
-        def made() -> tuple[SearchField, SearchField]:
+        def made(scale: int) -> SearchField:
             occupied, cell = self.segmap.map_of(segment)[0].occupied_cloud(), s.grid / 4.0
-            return (
-                SearchField(occupied, cell=cell, sigma=s.sigma),
-                SearchField(occupied, cell=2.0 * cell, sigma=2.0 * s.sigma),
-            )
+            return SearchField(occupied, cell=scale * cell, sigma=scale * s.sigma)
 
-        fine, coarse = self._fields.of(known, made)
+        fine = self._fields.of((*known, 1), lambda: made(1))
+        yield
+        coarse = self._fields.of((*known, 2), lambda: made(2))
+        yield
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
-        found = correlative_search(source, fine, T, half, steps, STARTS, coarse=coarse)
+        found = yield from searching(source, fine, T, half, steps, STARTS, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
         return [p.T for p in found if p.score >= max(LEAST_SCORE, best - SCORE_MARGIN)]
 

@@ -46,6 +46,9 @@ SCORE_BEAMS = 600
 SCORE_PARTICLES = 8
 """Most particles for the predictive score, selected by weight, if the filter decides as a whole: its mean score is
 used, and particles differ by less than 0.03 in it."""
+RESERVED = 65_536, 262_144
+"""Nodes and bricks of the maps from the beginning: unused ones take no physical memory, and growth copies all maps in
+one step."""
 KNOWN_RADIUS = 2.0
 """A place is known if the path of the map itself was within this distance [m] …"""
 KNOWN_GAP = 20.0
@@ -105,6 +108,7 @@ class SegSlamFilter:
     ) -> None:
         self.steps, self.config, self.seed = steps, config, seed
         self.filter = GridFilter(steps, filter, seed.child("filter"), prune_every=prune_every)
+        self.filter.pool.reserve(*RESERVED)
         n = filter.particles
         self.group = group_of(self.filter.particles.poses)
         self.at = -1
@@ -195,6 +199,7 @@ class SegSlamFilter:
             leaving[:] = True
         if not leaving.any():
             return
+        yield
         begin = time.perf_counter()
         chosen = np.flatnonzero(leaving).astype(np.int64)
         closed = self._close(k, chosen, why if ends.any() else "match")

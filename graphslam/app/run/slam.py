@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -123,6 +124,9 @@ class Slam:
                 return
             self._folder = self._stack.enter_context(RunFolder.start(out, options.as_config(), resume=False))
             self._stack.enter_context(one_blas_thread())
+            gc.collect()
+            gc.freeze()  # a full garbage collection during `add` takes 0.1 s, most of it for imported modules
+            self._stack.callback(gc.unfreeze)
             self._slam = SubmapSlam(options, self._feed, observers, self._folder)
 
     def add(self, records: Stream, stream: str | None = None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans, Odometry
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.io.growing_log import GrowingLog
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -110,8 +112,8 @@ def test_moment_matching_is_there_to_be_measured(log: SensorLog, submaps: list[S
         assert np.linalg.slogdet(theirs.exit_covariance)[1] < np.linalg.slogdet(ours.exit_covariance)[1]
 
 
-def test_a_step_in_slices_is_the_step_and_no_slice_holds_more_than_one_search(log: SensorLog) -> None:
-    """Between two records the work is one search or one registration, also when many maps are tried."""
+def test_a_step_in_slices_is_the_step_and_each_registration_and_part_of_a_search_has_its_own(log: SensorLog) -> None:
+    """Between two records the work is one registration or a part of a search, also when many maps are tried."""
     steps = SegSlam(CONFIGURATION).steps(log)
     whole, sliced = (
         SegSlamFilter(steps, CONFIGURATION.filter, CONFIG, SeedTree(0).child(0), prune_every=32) for _ in range(2)
@@ -124,8 +126,28 @@ def test_a_step_in_slices_is_the_step_and_no_slice_holds_more_than_one_search(lo
     assert [a.describe() for a in whole.attempts] == [a.describe() for a in sliced.attempts]
     assert most >= 2
     assert len(sliced.slice_seconds) > len(sliced.step_seconds) == len(steps)
-    searches = sum(a.searches + a.registrations for a in whole.attempts)
-    assert 0 < len(sliced.slice_seconds) - len(steps) <= 2 * searches
+    searches, registrations = (sum(getattr(a, n) for a in whole.attempts) for n in ("searches", "registrations"))
+    assert registrations >= searches > 0
+    assert len(sliced.slice_seconds) - len(steps) >= registrations + 5 * searches  # two fields, scores, maxima, modes
+
+
+def test_records_that_come_alone_wait_for_a_part_of_the_work_only(
+    log: SensorLog, submaps: list[Submap], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With pauses as long as a scan period, no record waits for more than two slices, also when the filter is late."""
+    period = float(np.diff(log["laser"].times).mean())
+    monkeypatch.setattr("graphslam_frontends.segslam.front_end.PAUSE", period)
+    feed, front = GrowingLog(log.name, tmp_path), SegSlam(CONFIGURATION)
+    follow, made, slices = front.follow(feed, seed=SeedTree(0)), list[Submap](), [0]
+    for _, stream, k in log.events():
+        feed.add(stream, log[stream].take(slice(k, k + 1)))
+        while (found := next(follow)) is not None:
+            made.append(found)
+        slices.append(len(front._live[0].run.slice_seconds) if front._live else 0)
+    assert 1 <= np.diff(slices).max() <= 2
+    feed.end()
+    made += [s for s in follow if s is not None]
+    assert [s.exit_covariance.tobytes() for s in made] == [s.exit_covariance.tobytes() for s in submaps]
 
 
 def test_options_that_need_the_whole_log_are_named_and_give_the_same_interface(log: SensorLog) -> None:
