@@ -89,7 +89,7 @@ def worlds() -> list[str]:
 
 
 def options(frontend: str | None = None) -> pd.DataFrame:
-    """Options of a front end, or of every run: a table of ``option``, ``type``, ``default`` and ``meaning``.
+    """Options of a front end, or of every run (None): a table of ``option``, ``type``, ``default`` and ``meaning``.
 
     Set them by ``config={"frontend": {"particles": 40}}`` of :func:`run`, or by ``--set frontend.particles=40``.
 

@@ -146,7 +146,7 @@ class SensorLog:
         return b - a
 
     def slice(self, t_start: float, t_end: float) -> SensorLog:
-        """Records with ``t_start <= t <= t_end``."""
+        """Records with ``t_start <= t <= t_end`` [s]."""
         cut = {}
         for name, s in self.streams.items():
             i, j = np.searchsorted(s.times, t_start, "left"), np.searchsorted(s.times, t_end, "right")

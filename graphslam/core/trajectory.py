@@ -135,7 +135,10 @@ class Trajectory:
         return np.asarray(i), np.asarray(j), np.asarray(u, dtype=np.float64)
 
     def interpolate(self, t: ArrayLike, *, max_gap: float | None = None) -> Array:
-        """Poses at times ``t`` ``(q,)`` along the geodesic between neighbours, position *and* heading."""
+        """Poses at times ``t`` ``(q,)`` [s] along the geodesic between neighbours, position *and* heading.
+
+        Neighbours more than ``max_gap`` [s] apart are refused (DataError).
+        """
         i, j, u = self._bracket(t, max_gap)
         a, b = self.poses[i], self.poses[j]
         if self.dim == 2:

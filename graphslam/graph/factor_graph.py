@@ -443,7 +443,10 @@ class FactorGraph(FactorGraphState):
         arm_j: ArrayLike | None = None,
         evidence: EvidenceUse | str = EXCLUSIVE,
     ) -> int:
-        """A distance between antennas at two nodes, lever arms ``(dim,)`` [m]; ``evidence`` as in `add_between`."""
+        """A distance [m] with its σ between antennas at nodes i and j, at the lever arms ``(dim,)`` [m] on the bodies.
+
+        ``evidence`` as in :meth:`add_between`.
+        """
         last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("a distance joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
@@ -564,7 +567,8 @@ class FactorGraph(FactorGraphState):
         robust: RobustKernel = NO_KERNEL,
         group: str = "between",
     ) -> int:
-        """A relative pose between nodes i and j; ``covariance`` (d, d) in the right tangent, d = 3 or 6.
+        """A relative pose ``T_ij`` ``(3,)`` or ``(7,)`` of node j in the frame of node i; ``covariance`` ``(d, d)`` in the
+        right tangent, d = 3 or 6.
 
         Parameters
         ----------
