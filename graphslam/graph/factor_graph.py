@@ -567,8 +567,7 @@ class FactorGraph(FactorGraphState):
         robust: RobustKernel = NO_KERNEL,
         group: str = "between",
     ) -> int:
-        """A relative pose ``T_ij`` ``(3,)`` or ``(7,)`` of node j in the frame of node i; ``covariance`` ``(d, d)`` in the
-        right tangent, d = 3 or 6.
+        """Relative pose ``T_ij`` ``(3,)`` or ``(7,)`` of node j in frame i; ``covariance`` ``(d, d)``, right tangent, d = 3, 6.
 
         Parameters
         ----------
