@@ -567,7 +567,7 @@ class FactorGraph(FactorGraphState):
         robust: RobustKernel = NO_KERNEL,
         group: str = "between",
     ) -> int:
-        """Relative pose ``T_ij`` ``(3,)`` or ``(7,)``, node j in frame i; ``covariance`` ``(d, d)`` in the right tangent.
+        """Relative pose ``T_ij`` ``(3,)`` or ``(7,)``, node j in frame i, with right-tangent ``covariance`` ``(d, d)``.
 
         Parameters
         ----------
