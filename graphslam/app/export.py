@@ -29,6 +29,7 @@ from graphslam.io.autoware import KIND as AUTOWARE
 from graphslam.io.autoware import write_autoware
 from graphslam.io.bag_writer import KIND as BAG
 from graphslam.io.bag_writer import BagForm
+from graphslam.io.cloud_writers import write_las
 from graphslam.io.geographic import GeographicMap, write_geojson, write_kml
 from graphslam.io.tum import embed_plane, write_kitti, write_tum
 from graphslam.maps.export import save_maps
@@ -151,14 +152,22 @@ def _floor_plans(run: Run, path: Path, _: WriteOptions) -> None:
         save_maps(made.fused.grid, folder, bands=made.bands)
 
 
-def _tiles(run: Run, path: Path, o: WriteOptions) -> None:
+def _placed_points(run: Run, o: WriteOptions) -> Array:
+    """Points of the dense map: east, north, up of the datum; without one in the frame of the map."""
     points = map_points(run)
-    if o.datum is not None:
-        check_geodetic(*o.datum)
-        T = map_to_enu(run, o.heading)
-        T = embed_plane(T[None])[0] if len(T) == 3 else T
-        points = se3_transform(T, points)
-    write_autoware(path, points, datum=o.datum)
+    if o.datum is None:
+        return points
+    check_geodetic(*o.datum)
+    T = map_to_enu(run, o.heading)
+    return se3_transform(embed_plane(T[None])[0] if len(T) == 3 else T, points)
+
+
+def _tiles(run: Run, path: Path, o: WriteOptions) -> None:
+    write_autoware(path, _placed_points(run, o), datum=o.datum)
+
+
+def _las(run: Run, path: Path, o: WriteOptions) -> None:
+    write_las(path, _placed_points(run, o))
 
 
 def _bag(form: BagForm) -> Callable[[Run, Path, WriteOptions], Any]:
@@ -174,6 +183,7 @@ WRITERS = {
     "kml": _globe(write_kml, "map.kml"),
     "geojson": _globe(write_geojson, "map.geojson"),
     "nav2": Writer(_floor_plans, None, folder=_FLOOR_PLANS),
+    "las": Writer(_las, "map.las"),
     "autoware": Writer(_tiles, None, folder=AUTOWARE),
     "mcap": Writer(_bag("mcap"), "run.mcap"),
     "ros2": Writer(_bag("ros2"), None, folder=BAG),
@@ -196,22 +206,22 @@ def export(
     run : Run, or folder of one
     datum : (latitude, longitude), optional
         Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84]. KML and GeoJSON need it;
-        an Autoware map is in the frame of the datum, or without a datum in its own frame.
+        Autoware and LAS points are east, north, up of the datum, or without a datum in the frame of the map.
     format : str
         One of the following, or the name of a registered :class:`Writer`.
         ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (input of evo). ``kml``,
         ``geojson``: path, landmarks with ellipses, fixes. ``nav2``: floor plans (map_server). ``autoware``: the map's
-        points in tiles, with ``map_projector_info.yaml``. ``mcap`` (a file) and ``ros2`` (a bag folder): messages of
-        ROS 2 in the frames ``map`` (first base) and ``base``, with the stamps of the log: ``/tf``, ``/path``, ``/pose``
-        with covariances, ``/markers`` (ellipses, landmarks, loop closures) and, with a dense map, ``/map`` and
-        ``/points``.
+        points in tiles, with ``map_projector_info.yaml``. ``las``: the same points in one file. ``mcap`` (a file) and
+        ``ros2`` (a bag folder): messages of ROS 2 in the frames ``map`` (first base) and ``base``, with the stamps of
+        the log: ``/tf``, ``/path``, ``/pose`` with covariances, ``/markers`` (ellipses, landmarks, loop closures) and,
+        with a dense map, ``/map`` and ``/points``.
     heading : float, optional
         Of the first base's x axis, degrees clockwise from north; with a datum, for runs without GPS.
     confidence : float
         Of the ellipses.
     out : path, optional
-        Default: ``map.<format>``, ``path.<format>`` or ``run.mcap`` in the run's folder; ``nav2``, ``autoware`` and
-        ``ros2`` write a folder, whose name is required.
+        Default: ``map.<format>`` (LAS: ``.laz`` compresses), ``path.<format>`` or ``run.mcap`` in the run's folder;
+        ``nav2``, ``autoware`` and ``ros2`` write a folder, whose name is required.
 
     Returns
     -------
@@ -225,9 +235,9 @@ def export(
     ConfigError
         A datum or a heading is missing, or must not be given; no output path.
     MissingDataError
-        A run without a dense map, for ``nav2`` and ``autoware``.
+        A run without a dense map, for ``nav2``, ``las`` and ``autoware``.
     MissingExtraError
-        The extra ``ros`` is not installed, for ``mcap`` and ``ros2``.
+        The extra ``ros`` is not installed, for ``mcap`` and ``ros2``; or ``las``, for ``las``.
     RunFolderError, FormatError
         Not a finished run, or a damaged one.
     OutputError

@@ -16,24 +16,13 @@ from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.output_folder import output_folder
+from graphslam.io.cloud_writers import write_pcd
 
 TILE = 20.0
 """Side of a tile [m]."""
 KIND = "map in tiles"
 """See :func:`~graphslam.core.output_folder.check_folder_target`."""
 _TILES, _PROJECTOR = "pointcloud_map_metadata.yaml", "map_projector_info.yaml"
-
-
-def write_pcd(path: str | os.PathLike[str], points: Array) -> None:
-    """Write points ``(n, 3)`` [m] as binary PCD 0.7, float32."""
-    rows = np.ascontiguousarray(points, dtype="<f4")
-    n = len(rows)
-    head = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-    )
-    head += f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
-    with atomic_open(path) as stream:
-        stream.write(head.encode() + rows.tobytes())
 
 
 def write_autoware(

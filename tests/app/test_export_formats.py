@@ -19,6 +19,7 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.io.autoware import write_autoware
 from graphslam.io.cloud_files import read_cloud
+from graphslam.io.cloud_writers import write_las
 from graphslam.io.tum import read_tum
 from tests.reference.map_server import read_map_server
 
@@ -88,6 +89,22 @@ def test_autoware_reads_tiles_that_hold_every_point_once(hall: Run, tmp_path: Pa
     np.testing.assert_allclose(np.sort(turned[:, 1]), np.sort(wanted[:, 0]), atol=1e-3)
     export(hall, format="autoware", out=tmp_path / "own")
     assert yaml.safe_load((tmp_path / "own" / "map_projector_info.yaml").read_text()) == {"projector_type": "Local"}
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_las_has_every_point_to_half_a_millimetre(hall: Run, tmp_path: Path, ending: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    file = export(hall, (35.68, 139.76), heading=0.0, format="las", out=tmp_path / f"map.{ending}")
+    las = laspy.read(file)
+    assert (las.header.version.minor, las.header.are_points_compressed) == (4, ending == "laz")
+    wanted = map_points(hall) @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # a heading of 0°: x is north
+    np.testing.assert_allclose(las.xyz, wanted, atol=0.00051)
+    np.testing.assert_allclose(read_cloud(file).points, wanted, atol=0.00051)
+    kept = file.read_bytes()
+    export(hall, (35.68, 139.76), heading=0.0, format="las", out=file)
+    assert file.read_bytes() == kept
+    with pytest.raises(DataError, match="without a point"):
+        write_las(tmp_path / "empty.las", np.zeros((0, 3)))
 
 
 def test_pandas_and_open3d(hall: Run) -> None:

@@ -88,12 +88,12 @@ def export_command(
     format: str = typer.Option(
         "tum",
         help="Path: tum or kitti. Map on the globe: kml, or geojson for GIS programs. Floor plans: nav2. "
-        "Points in tiles: autoware. For Foxglove: mcap. For ros2 bag play: ros2.",
+        "Points: las, or in tiles autoware. For Foxglove: mcap. For ros2 bag play: ros2.",
     ),
     datum: str | None = typer.Option(
         None,
         help="Origin of the GPS frame as LAT,LON in degrees (WGS 84); without GPS, of the first pose. "
-        "For kml, geojson and autoware.",
+        "For kml, geojson, las and autoware.",
     ),
     heading: float | None = typer.Option(
         None, help="Without GPS: heading of the first pose in degrees, clockwise from north."
