@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import DataError, GeometryError
+from graphslam.core.errors import GeometryError
 from graphslam.core.geodesy import geodetic_to_ecef, tangent_axes
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.reading import finite_mask
-from graphslam.core.records import check_times
+from graphslam.core.records import RaggedStream, array_of, finite, positive
 
 SPEED_OF_LIGHT = 299_792_458.0
 """[m/s]"""
@@ -21,7 +19,7 @@ EARTH_RATE = 7.2921151467e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pseudoranges:
+class Pseudoranges(RaggedStream):
     """Pseudoranges of several satellites at each epoch (ragged).
 
     A pseudorange is the distance to the satellite plus the receiver clock offset times the speed of light, corrected
@@ -47,6 +45,7 @@ class Pseudoranges:
         Antenna in the base frame [m].
     """
 
+    ROWS = ("ranges", "sigmas", "satellites", "ids", "systems", "elevation", "density")
     times: Array
     offsets: npt.NDArray[np.int64]
     ranges: Array
@@ -59,44 +58,22 @@ class Pseudoranges:
     lever: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "times", check_times(self.times))
-        offsets, q = np.ascontiguousarray(self.offsets, dtype=np.int64), len(self.ranges)
-        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
-            raise DataError(
-                "offsets do not partition the pseudoranges", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
-            )
-        object.__setattr__(self, "offsets", offsets)
+        q = len(self.ranges)
+        self._check_offsets(q)
         shapes = {"satellites": (q, 3), "lever": (3,)}
-        for name in ("ranges", "sigmas", "satellites", "elevation", "density", "lever"):
-            a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if a.shape != shapes.get(name, (q,)):
-                raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shapes.get(name, (q,)))
-            if not np.all(finite_mask(a)):
-                k = int(np.argwhere(~finite_mask(a))[0][0])
-                raise DataError(f"{name} of pseudorange {k} is not finite", got=a[k], wanted="finite numbers")
-            object.__setattr__(self, name, a)
+        for name in ("ranges", "satellites", "elevation", "density", "lever"):
+            object.__setattr__(self, name, finite(array_of(getattr(self, name), shapes.get(name, (q,)), name), name))
+        object.__setattr__(self, "sigmas", positive(self.sigmas, q, "pseudorange", "m"))
         for name in ("ids", "systems"):
             w = np.ascontiguousarray(getattr(self, name), dtype=np.int64)
             if w.shape != (q,):
                 raise GeometryError(f"{name} has the wrong shape", got=w.shape, wanted=(q,))
             object.__setattr__(self, name, w)
-        if np.any(self.sigmas <= 0):
-            k = int(np.flatnonzero(self.sigmas <= 0)[0])
-            raise DataError(f"sigma of pseudorange {k} is not positive", got=self.sigmas[k], wanted="> 0 m")
 
     @property
     def epochs(self) -> npt.NDArray[np.int64]:
         """Epoch of every pseudorange ``(q,)``."""
         return np.repeat(np.arange(len(self.times)), np.diff(self.offsets))
-
-    def take(self, index: Any) -> Pseudoranges:
-        """See :class:`graphslam.core.records.Stream`."""
-        keep = np.arange(len(self.times))[index]
-        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
-        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
-        names = ("ranges", "sigmas", "satellites", "ids", "systems", "elevation", "density")
-        return replace(self, times=self.times[keep], offsets=offsets, **{n: getattr(self, n)[r] for n in names})
 
 
 @dataclass(frozen=True, slots=True)

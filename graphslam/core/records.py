@@ -46,6 +46,40 @@ class RowStream:
         return replace(stream, **{name: a if a is None else a[index] for name, a in columns.items()})
 
 
+class RaggedStream:
+    """A stream with several rows for each stamp: those of scan k begin at ``offsets[k]`` (n + 1,).
+
+    The fields :attr:`ROWS` have these rows, or are None.
+    """
+
+    __slots__ = ()
+    ROWS: ClassVar[tuple[str, ...]]
+    times: Array
+    offsets: npt.NDArray[np.int64]
+
+    def _check_offsets(self, rows: int) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+        o, n = np.ascontiguousarray(self.offsets, dtype=np.int64), len(self.times)
+        if len(o) != n + 1 or o[0] != 0 or o[-1] != rows or np.any(np.diff(o) < 0):
+            raise DataError("offsets do not partition the observations", got=o.shape, wanted=f"({n + 1},)")
+        object.__setattr__(self, "offsets", o)
+
+    def scan(self, k: int) -> slice:
+        """Rows of scan k."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def take(self, index: Any) -> Self:
+        """See :class:`Stream`."""
+        keep = np.arange(len(self.times))[index]
+        parts = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
+        rows = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
+        offsets = np.cumsum([0, *(len(part) for part in parts)], dtype=np.int64)
+        columns = {name: getattr(self, name) for name in self.ROWS}
+        stream: Any = self
+        kept = {name: a if a is None else a[rows] for name, a in columns.items()}
+        return replace(stream, times=self.times[keep], offsets=offsets, **kept)
+
+
 PLAIN: dict[str, type[Any]] = {}
 """Record types whose fields are all numbers ``(n,)``, by type name in a stored log."""
 
@@ -82,26 +116,39 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
     return t
 
 
-def _array(x: Any, shape: tuple[int, ...], name: str) -> Array:
+def array_of(x: Any, shape: tuple[int, ...], name: str) -> Array:
+    """A float array of a shape; -1: any length."""
     a = np.ascontiguousarray(x, dtype=np.float64)
     if len(a.shape) != len(shape) or any(w not in (-1, g) for g, w in zip(a.shape, shape)):
         raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shape)
     return a
 
 
-def _finite(a: Array, name: str) -> Array:
+def finite(a: Array, name: str) -> Array:
+    """The array, if it is finite."""
     if not np.all(finite_mask(a)):
         k = int(np.argwhere(~finite_mask(a))[0][0])
         raise DataError(f"{name} of record {k} is not finite", got=a[k], wanted="finite numbers")
     return a
 
 
-def _positive(sigma: Any, n: int, what: str, unit: str) -> Array:
-    a = _finite(_array(sigma, (n,), "sigma"), "sigma")
+def positive(sigma: Any, n: int, what: str, unit: str) -> Array:
+    """Standard deviations ``(n,)``, if they are positive."""
+    a = finite(array_of(sigma, (n,), "sigma"), "sigma")
     if np.any(a <= 0):
         k = int(np.flatnonzero(a <= 0)[0])
         raise DataError(f"sigma of {what} {k} is not positive", got=a[k], wanted=f"> 0 {unit}")
     return a
+
+
+def _covariances(covariances: Any, n: int, dim: int, what: str) -> Array:
+    P = finite(array_of(covariances, (n, dim, dim), "covariances"), "covariance")
+    skew, size = (np.abs(A).max(axis=(1, 2), initial=0.0) for A in (P - np.swapaxes(P, 1, 2), P))
+    bad = (skew > 1e-6 * size) | (np.linalg.eigvalsh(P)[:, 0] <= 0)
+    if np.any(bad):
+        k = int(bad.argmax())
+        raise DataError(f"covariance of {what} {k} is not symmetric and positive definite", got=P[k].tolist())
+    return P
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +186,7 @@ class LaserScans(RowStream):
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", check_times(self.times, len(self.ranges)))
         object.__setattr__(self, "bearings", check_times(self.bearings, self.ranges.shape[1], where="beam bearings"))
-        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
+        object.__setattr__(self, "T_base_sensor", array_of(self.T_base_sensor, (3,), "T_base_sensor"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,7 +252,7 @@ class SteeringControls(RowStream):
         object.__setattr__(self, "times", check_times(self.times))
         n = len(self.times)
         for name in ("speed", "steering"):
-            object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
+            object.__setattr__(self, name, finite(array_of(getattr(self, name), (n,), name), name))
 
 
 @plain_record("velocity-controls")
@@ -240,7 +287,7 @@ class VelocityControls(RowStream):
         object.__setattr__(self, "times", check_times(self.times))
         n = len(self.times)
         for name in ("speed", "yaw_rate"):
-            object.__setattr__(self, name, _finite(_array(getattr(self, name), (n,), name), name))
+            object.__setattr__(self, name, finite(array_of(getattr(self, name), (n,), name), name))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,10 +318,10 @@ class Odometry(RowStream):
     def __post_init__(self) -> None:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
-        object.__setattr__(self, "increments", _finite(_array(self.increments, (n, -1), "increments"), "increment"))
+        object.__setattr__(self, "increments", finite(array_of(self.increments, (n, -1), "increments"), "increment"))
         d = 3 if self.increments.shape[1] == 3 else 6
         object.__setattr__(
-            self, "covariances", _finite(_array(self.covariances, (n, d, d), "covariances"), "covariance")
+            self, "covariances", finite(array_of(self.covariances, (n, d, d), "covariances"), "covariance")
         )
 
 
@@ -310,21 +357,11 @@ class Gps(RowStream):
     def __post_init__(self) -> None:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
-        object.__setattr__(self, "positions", _finite(_array(self.positions, (n, -1), "positions"), "position"))
-        object.__setattr__(self, "sigma", _positive(self.sigma, n, "GPS record", "m"))
-        object.__setattr__(self, "lever", _array(self.lever, (self.positions.shape[1],), "lever"))
+        object.__setattr__(self, "positions", finite(array_of(self.positions, (n, -1), "positions"), "position"))
+        object.__setattr__(self, "sigma", positive(self.sigma, n, "GPS record", "m"))
+        object.__setattr__(self, "lever", array_of(self.lever, (self.positions.shape[1],), "lever"))
         if self.covariances is not None:
-            c = self.positions.shape[1]
-            P = _finite(_array(self.covariances, (n, c, c), "covariances"), "GPS covariance")
-            bad = np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(P).max(axis=(1, 2))
-            bad |= np.linalg.eigvalsh(P)[:, 0] <= 0
-            if np.any(bad):
-                k = int(bad.argmax())
-                raise DataError(
-                    f"GPS covariance of record {k} is not symmetric and positive definite",
-                    got=P[k],
-                    wanted="one that is",
-                )
+            P = _covariances(self.covariances, n, self.positions.shape[1], "GPS record")
             object.__setattr__(self, "covariances", P)
 
     @classmethod
@@ -379,8 +416,8 @@ class Compass(RowStream):
     def __post_init__(self) -> None:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
-        object.__setattr__(self, "headings", _finite(_array(self.headings, (n,), "headings"), "heading"))
-        object.__setattr__(self, "sigma", _positive(self.sigma, n, "compass reading", "rad"))
+        object.__setattr__(self, "headings", finite(array_of(self.headings, (n,), "headings"), "heading"))
+        object.__setattr__(self, "sigma", positive(self.sigma, n, "compass reading", "rad"))
 
 
 @plain_record("barometer")
@@ -405,12 +442,12 @@ class Barometer(RowStream):
     def __post_init__(self) -> None:
         n = len(self.times)
         object.__setattr__(self, "times", check_times(self.times))
-        object.__setattr__(self, "heights", _finite(_array(self.heights, (n,), "heights"), "height"))
-        object.__setattr__(self, "sigma", _positive(self.sigma, n, "barometer reading", "m"))
+        object.__setattr__(self, "heights", finite(array_of(self.heights, (n,), "heights"), "height"))
+        object.__setattr__(self, "sigma", positive(self.sigma, n, "barometer reading", "m"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LandmarkObservations:
+class LandmarkObservations(RaggedStream):
     """Range-bearing or range-only observations of point landmarks, several per scan (ragged).
 
     Parameters
@@ -441,6 +478,7 @@ class LandmarkObservations:
     np.int64(3)
     """
 
+    ROWS = ("ranges", "bearings", "sigmas", "ids")
     times: Array
     offsets: npt.NDArray[np.int64]
     ranges: Array
@@ -452,20 +490,14 @@ class LandmarkObservations:
     T_base_sensor: Array = field(default_factory=lambda: IDENTITY2.copy())
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "times", check_times(self.times))
-        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
         q = len(self.ranges)
-        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
-            raise DataError(
-                "offsets do not partition the observations", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
-            )
-        object.__setattr__(self, "offsets", offsets)
+        self._check_offsets(q)
         for name, shape in (("ranges", (q,)), ("bearings", (q,)), ("sigmas", (q, 2))):
-            object.__setattr__(self, name, _array(getattr(self, name), shape, name))
+            object.__setattr__(self, name, array_of(getattr(self, name), shape, name))
         blind = np.isposinf(self.sigmas[:, 1])
-        _finite(self.ranges, "ranges")
-        _finite(self.bearings, "bearings")
-        _finite(np.where(blind[:, None], self.sigmas[:, :1], self.sigmas), "sigmas")
+        finite(self.ranges, "ranges")
+        finite(self.bearings, "bearings")
+        finite(np.where(blind[:, None], self.sigmas[:, :1], self.sigmas), "sigmas")
         if np.any(blind & (self.bearings != 0.0)):
             k = int(np.flatnonzero(blind & (self.bearings != 0.0))[0])
             raise DataError(
@@ -478,7 +510,7 @@ class LandmarkObservations:
             object.__setattr__(self, "ids", np.ascontiguousarray(self.ids, dtype=np.int64))
             if self.ids.shape != (q,):
                 raise DataError("ids and observations differ in number", got=self.ids.shape, wanted=f"({q},)")
-        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (3,), "T_base_sensor"))
+        object.__setattr__(self, "T_base_sensor", array_of(self.T_base_sensor, (3,), "T_base_sensor"))
 
     @classmethod
     def range_only(
@@ -511,29 +543,9 @@ class LandmarkObservations:
         """Mask of the observations with a bearing ``(q,)``."""
         return np.asarray(np.isfinite(self.sigmas[:, 1]))
 
-    def scan(self, k: int) -> slice:
-        """Rows of scan k."""
-        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
-
-    def take(self, index: Any) -> LandmarkObservations:
-        """See :class:`Stream`."""
-        keep = np.arange(len(self.times))[index]
-        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
-        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        offsets = np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64)
-        return replace(
-            self,
-            times=self.times[keep],
-            offsets=offsets,
-            ranges=self.ranges[r],
-            bearings=self.bearings[r],
-            sigmas=self.sigmas[r],
-            ids=None if self.ids is None else self.ids[r],
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointObservations:
+class PointObservations(RaggedStream):
     """Observations of identified 3-D points, several per scan (ragged), e.g. from a stereo or depth camera.
 
     Parameters
@@ -559,6 +571,7 @@ class PointObservations:
     array([4])
     """
 
+    ROWS = ("points", "covariances", "ids")
     times: Array
     offsets: npt.NDArray[np.int64]
     points: Array
@@ -567,50 +580,15 @@ class PointObservations:
     T_base_sensor: Array = field(default_factory=lambda: IDENTITY3.copy())
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "times", check_times(self.times))
-        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
         q = len(self.points)
-        if len(offsets) != len(self.times) + 1 or offsets[0] != 0 or offsets[-1] != q or np.any(np.diff(offsets) < 0):
-            raise DataError(
-                "offsets do not partition the observations", got=offsets.shape, wanted=f"({len(self.times) + 1},)"
-            )
-        object.__setattr__(self, "offsets", offsets)
-        object.__setattr__(self, "points", _finite(_array(self.points, (q, 3), "points"), "points"))
-        covariances = _finite(_array(self.covariances, (q, 3, 3), "covariances"), "covariances")
-        if q:
-            low = np.linalg.eigvalsh(covariances)[:, 0]
-            asymmetric = np.abs(covariances - covariances.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-6 * np.abs(
-                covariances
-            ).max(axis=(1, 2))
-            if np.any((low <= 0.0) | asymmetric):
-                k = int(np.flatnonzero((low <= 0.0) | asymmetric)[0])
-                raise DataError(
-                    f"covariance of observation {k} is not symmetric and positive definite", got=covariances[k].tolist()
-                )
-        object.__setattr__(self, "covariances", covariances)
+        self._check_offsets(q)
+        object.__setattr__(self, "points", finite(array_of(self.points, (q, 3), "points"), "points"))
+        object.__setattr__(self, "covariances", _covariances(self.covariances, q, 3, "observation"))
         ids = np.ascontiguousarray(self.ids, dtype=np.int64)
         if ids.shape != (q,) or np.any(ids < 0):
             raise DataError("ids of points are missing or negative", got=ids.shape, wanted=f"({q},), each ≥ 0")
-        scan = np.repeat(np.arange(len(self.times)), np.diff(offsets))
+        scan = np.repeat(np.arange(len(self.times)), np.diff(self.offsets))
         if len(np.unique(np.column_stack([scan, ids]), axis=0)) < q:
             raise DataError("an id is repeated in one scan", wanted="each once")
         object.__setattr__(self, "ids", ids)
-        object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (7,), "T_base_sensor"))
-
-    def scan(self, k: int) -> slice:
-        """Rows of scan k."""
-        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
-
-    def take(self, index: Any) -> PointObservations:
-        """See :class:`Stream`."""
-        keep = np.arange(len(self.times))[index]
-        rows = [np.arange(self.offsets[k], self.offsets[k + 1]) for k in keep]
-        r = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        return replace(
-            self,
-            times=self.times[keep],
-            offsets=np.concatenate([[0], np.cumsum([len(x) for x in rows])]).astype(np.int64),
-            points=self.points[r],
-            covariances=self.covariances[r],
-            ids=self.ids[r],
-        )
+        object.__setattr__(self, "T_base_sensor", array_of(self.T_base_sensor, (7,), "T_base_sensor"))

@@ -55,15 +55,19 @@ def cut_beams(
 
 
 @dataclass(slots=True)
-class _Spinning:
-    scans: RangeScans
+class _Beams:
+    scans: Any
     record: Index
     beam: Index
     times: Array
     max_range: float
     sigma: float
     skipped: Array
-    dim: int = 3
+
+
+class _Spinning(_Beams):
+    scans: RangeScans
+    dim = 3
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         s, k, j = self.scans, self.record[chosen], self.beam[chosen]
@@ -74,16 +78,9 @@ class _Spinning:
         return origins, origins + reach[:, None] * s.beam_directions(k, j), met
 
 
-@dataclass(slots=True)
-class _Planar:
+class _Planar(_Beams):
     scans: LaserScans
-    record: Index
-    beam: Index
-    times: Array
-    max_range: float
-    sigma: float
-    skipped: Array
-    dim: int = 2
+    dim = 2
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         s, k, j = self.scans, self.record[chosen], self.beam[chosen]
@@ -93,19 +90,12 @@ class _Planar:
         return origins, origins + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]), ranges < s.max_range
 
 
-@dataclass(slots=True)
-class _Clouds:
-    clouds: PointClouds
-    record: Index
-    row: Index
-    times: Array
-    max_range: float
-    sigma: float
-    skipped: Array
-    dim: int = 3
+class _Clouds(_Beams):
+    scans: PointClouds
+    dim = 3
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        c, record, row = self.clouds, self.record[chosen], self.row[chosen]
+        c, record, row = self.scans, self.record[chosen], self.beam[chosen]
         ends = np.empty((len(chosen), 3))
         bounds = np.flatnonzero(np.append(True, np.diff(record) != 0)) if len(record) else np.zeros(0, dtype=np.int64)
         for a, b in zip(bounds, np.append(bounds[1:], len(record))):
