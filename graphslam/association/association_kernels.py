@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-@njit
+@callee
 def _mahalanobis(vx: float, vy: float, a: float, b: float, c: float) -> tuple[float, float]:
     """``vᵀ [[a, b], [b, c]]⁻¹ v`` and the determinant."""
     det = a * c - b * b

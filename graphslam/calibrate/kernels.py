@@ -33,7 +33,7 @@ from graphslam.calibrate.residual_kernels import (
     visit_row,
     wrap_residual,
 )
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "rows", "pivots", "order", "when", "at"])
 """Output of :func:`eliminate_window`."""
@@ -41,7 +41,7 @@ _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
 _FAR = 1e-8  # prior information of a landmark position [1/m²]
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def _add(row, n, blocks):
     """Add one whitened residual row to the blocks of this pose, of the next one, and of ``n`` border columns."""
     jp, jn, cols, vals = row
@@ -66,7 +66,7 @@ def _add(row, n, blocks):
                 S[a, b] += vals[i] * vals[j]
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def _leave(at, active, A, C, S, row):
     """Eliminate a border column without later observations; its row goes to ``row``. Returns the pivot."""
     D, m = C.shape
@@ -291,7 +291,7 @@ def substitute_window(work, dg, d_poses, d_nuisance):
             last -= 1
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def _enter(M, coefficients, at, pivot, variance):
     """Second moments ``M`` of z where z[at] becomes -coefficients · z / pivot + noise of a variance."""
     f, new = len(M), M[at]
@@ -308,7 +308,7 @@ def _enter(M, coefficients, at, pivot, variance):
             M[i, at] = new[i]
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def _unexplained(row, n, M, here, then):
     """1 minus the expected square of a whitened residual: a variance is too small where it is below 0."""
     jp, jn, cols, vals = row
@@ -327,7 +327,7 @@ def _unexplained(row, n, M, here, then):
     return 1.0 - total
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def _spread(step, p, axis, slope, out):
     """Add twice a derivative by the variance of a step along an axis to those of the standard deviations in it."""
     turn, dt, d = abs(step[2]), step[3], step[4]

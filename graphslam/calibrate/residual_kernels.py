@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee
 
 YAW_BIAS, DISTANCE_SCALE, TURN_PER_METRE, TURN_SCALE, RANGE_SCALE, RANGE_OFFSET, SENSOR_YAW = range(7)
 CONSTANTS = 7
@@ -34,13 +34,13 @@ Row = namedtuple("Row", ["jp", "jn", "cols", "vals"])
 """Jacobians by this pose and the next one; border columns and their values, the first one the right-hand side."""
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def wrap_residual(a):
     """Angle in (-π, π]."""
     return math.pi - (math.pi - a) % (2.0 * math.pi)
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def lever_and_offset(x, landmark, sensor):
     """From the base to the sensor, and from the sensor to a landmark, along the axes of the map."""
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -48,7 +48,7 @@ def lever_and_offset(x, landmark, sensor):
     return ox, oy, landmark[0] - x[0] - ox, landmark[1] - x[1] - oy
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def range_row(x, nuisance, model, data, q, at, row):
     """Whitened residual of the range of observation ``q`` from pose ``x``; returns its number of border columns."""
     jp, _, cols, vals = row
@@ -76,7 +76,7 @@ def range_row(x, nuisance, model, data, q, at, row):
     return count
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def bearing_row(x, nuisance, model, data, q, at, row):
     """Whitened residual of the bearing of observation ``q`` from pose ``x``; returns its number of border columns."""
     jp, _, cols, vals = row
@@ -104,7 +104,7 @@ def bearing_row(x, nuisance, model, data, q, at, row):
     return count
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def visit_row(value, part, p, at, row):
     """Whitened prior of the range (``part`` 0) or bearing (1) of a visit."""
     _, _, cols, vals = row
@@ -112,7 +112,7 @@ def visit_row(value, part, p, at, row):
     cols[1], vals[0], vals[1] = HEAD + 2 * at + part, -w * value, w
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def motion_variances(step, p, out):
     """Variances of a step: along, lateral, heading."""
     turn, dt, d = step[2], step[3], step[4]
@@ -126,7 +126,7 @@ def motion_variances(step, p, out):
         out[1], out[2] = step[6], step[7]
 
 
-@njit(error_model="numpy", nogil=True)
+@callee(error_model="numpy")
 def motion_row(x, then, g, step, variances, axis, row):
     """Whitened residual of a step from pose ``x`` to ``then``: along, lateral or heading; 5 border columns."""
     jp, jn, cols, vals = row

@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +44,10 @@ def without_garbage_collection() -> Iterator[None]:
 with without_garbage_collection():
     import numba
     from numba.core import caching, event
+    from numba.extending import register_jitable
 
 logger = logging.getLogger(__name__)
 
-COMPILING = "GRAPHSLAM_COMPILING"
-"""Environment variable of processes that compile for another one."""
 MOST_BYTES = 1_000_000_000
 """Largest size of the compiled code of all versions."""
 UNUSED_SECONDS = 30 * 86_400.0
@@ -57,21 +56,24 @@ _IMPORTED = re.compile(r"^from (graphslam[\w.]*) import", re.MULTILINE)
 
 
 class _Compilations(event.Listener):
-    """Compile time of this process; progress bars show the compilation."""
+    """Compile time of this process; progress bars show the compilation. Garbage is collected after it."""
 
     def __init__(self) -> None:
         self.seconds, self._depth, self._since = 0.0, 0, 0.0
+        self._uncollected = contextlib.ExitStack()
 
     def on_start(self, event: Any) -> None:
         self._depth += 1
         if self._depth == 1:
             self._since = time.perf_counter()
+            self._uncollected.enter_context(without_garbage_collection())
             show_compiling(True)
 
     def on_end(self, event: Any) -> None:
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._since
+            self._uncollected.close()
             show_compiling(False)
 
 
@@ -80,18 +82,8 @@ event.register("numba:compile", _compilations)
 
 
 def compile_seconds() -> float:
-    """Time of this process for compiling kernels, or waiting for another process to do so [s]."""
+    """Time of this process for compiling kernels [s]."""
     return _compilations.seconds
-
-
-@contextmanager
-def compiling_elsewhere() -> Iterator[None]:
-    """Count the block as compile time: another process compiles for this one."""
-    begin = time.perf_counter()
-    try:
-        yield
-    finally:
-        _compilations.seconds += time.perf_counter() - begin
 
 
 def compiled_root() -> Path:
@@ -167,7 +159,7 @@ def unwritable() -> str:
 
 @cache
 def _warn_not_kept(why: str) -> None:
-    if multiprocessing.parent_process() is None and COMPILING not in os.environ:
+    if multiprocessing.parent_process() is None:
         logger.warning(
             "compiled code cannot be kept in %s (%s): kernels are compiled again at every start, about a minute; "
             "make the folder writable or set NUMBA_CACHE_DIR to one that is",
@@ -268,7 +260,16 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda decorated: njit(decorated, **options)
+    options.setdefault("no_cfunc_wrapper", True)  # for calls from C
     made = numba.njit(**options)(function)
     if hasattr(made, "enable_caching"):  # with NUMBA_DISABLE_JIT it is the function itself
         made._cache = _cache_of(function)
     return made
+
+
+def callee(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Decorator of a function that only kernels call: without wrapper for Python and file, which take time to compile.
+
+    Called from Python, its source runs. Options are those of ``numba.njit`` except ``cache``.
+    """
+    return register_jitable(**options, no_cfunc_wrapper=True)(function) if function else partial(callee, **options)

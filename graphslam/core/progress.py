@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 from tqdm import tqdm
 
-COMPILING = "compiling (first run only, ~1 min)"
+COMPILING = "compiling (first run only, about 25 s for a lidar log)"
 """Text of a bar while kernels are compiled."""
 
 
@@ -100,15 +99,3 @@ def show_compiling(now: bool) -> None:
             bar.note(COMPILING)
         elif bar.postfix == COMPILING:
             bar.set_postfix_str("", refresh=False)
-
-
-@contextmanager
-def compiling() -> Iterator[None]:
-    """Show that kernels are compiled, in the current bar or in a new one."""
-    if shown_bars():
-        show_compiling(True)
-        yield
-        show_compiling(False)
-        return
-    with Bar(name=COMPILING, bar_format="{desc}"):
-        yield

@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 MAX_RANGE, HIT, INSIDE, LEFT, UNUSABLE, UNKNOWN_SPACE = 0, 1, 2, 3, 4, 5
@@ -27,7 +28,7 @@ NEAR = 1e-9
 FLAT, NEVER = 1e-200, 1e300
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def coordinate_after(o, d, inverse, first, t, closed):
     """Voxel coordinate on one axis after the ray crossed all planes before ``t`` (with ``closed`` also those at ``t``).
 
@@ -46,7 +47,7 @@ def coordinate_after(o, d, inverse, first, t, closed):
     return min(k, first)
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def crossed_lines(oy, dy, oz, dz, t, end):
     """Bits of the lines of a brick (8 x 4 x 1 voxels each) that a ray may cross between parameters t and end.
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 from graphslam.evidence.tree_kernels import (
     child_index,
@@ -43,7 +44,7 @@ class States(NamedTuple):
     node_max: npt.NDArray[np.int16]
 
 
-@kernel()
+@callee
 def voxel_state(value, classes, threshold):
     """State of one voxel."""
     v = int(value)
@@ -52,7 +53,7 @@ def voxel_state(value, classes, threshold):
     return 1 if v >= threshold else -1
 
 
-@kernel()
+@callee
 def voxels_state(row, classes, threshold):
     """State of a brick, given its voxels ``(512,)``."""
     if classes:
@@ -71,7 +72,7 @@ def voxels_state(row, classes, threshold):
     return int(first)
 
 
-@kernel()
+@callee
 def child_state(child, level, states):
     """State and largest known value of a child of a node of level ``level``."""
     want_max = states.brick_max.shape[0] > 0
@@ -212,7 +213,7 @@ def list_pieces(root, levels, children, states, mixed, cubes, found):
 # --- building a tree without other owners: capacity reserved, root owned, no shared node on any path --------------
 
 
-@kernel()
+@callee
 def make_path(root, bx, by, bz, size, tree):
     """Node above a brick whose children are cubes of size ``size``, and the child index; missing nodes are created."""
     node = root
@@ -226,7 +227,7 @@ def make_path(root, bx, by, bz, size, tree):
     return node, child_index(bx, by, bz, size)
 
 
-@kernel()
+@callee
 def uniform_cube(size, value, threshold, uniform, tree):
     """Brick or node whose voxels all have one value; created if ``uniform (levels, 65536) int32`` has none yet.
 
@@ -258,7 +259,7 @@ def uniform_cube(size, value, threshold, uniform, tree):
     return int(uniform[size, k])
 
 
-@kernel()
+@callee
 def finalise_occupied(root, threshold, tree):
     """Set the occupancy flags of a new tree; parts with several parents have theirs already."""
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)

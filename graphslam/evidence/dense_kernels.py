@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 from graphslam.evidence.tree_kernels import find_node
 
 
-@kernel()
+@callee
 def row_of_bricks(root, bx, by, bz, levels, children, ids):
     """Ids of bricks bx, bx + 1, … at given by and bz; 0 (the unknown brick) if absent or outside the cube."""
     edge = 1 << (2 * levels)

@@ -21,6 +21,7 @@ import math
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 # counters of a tally, per call
@@ -35,7 +36,7 @@ ONE = 2.0**58  # parameter of the end of a beam in fixed point
 NEVER = 2**61
 
 
-@kernel()
+@callee
 def voxel_code(x, y, z):
     """Code of a voxel: integer with separate bit fields of its offset coordinates."""
     return (
@@ -51,7 +52,7 @@ def voxel_code(x, y, z):
     )
 
 
-@kernel()
+@callee
 def brick_key(code):
     """Packed brick coordinates (20 bits each) from the code of a brick."""
     bx = (code & 0x3F) | (((code >> 18) & 0x1FF) << 6)
@@ -60,7 +61,7 @@ def brick_key(code):
     return (bz << 40) | (by << 20) | bx
 
 
-@kernel()
+@callee
 def find_slot(code, n, window, slot_key, slot_next):
     """Slot of a brick that is not the last one of its entry; n if it is new, -1 if all slots are in use."""
     w = code & 0x3FFFF
@@ -78,7 +79,7 @@ def find_slot(code, n, window, slot_key, slot_next):
     return n
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def fixed_point(parameter):
     """Parameter along a beam in fixed point; `NEVER` if it is too large or NaN."""
     f = parameter * ONE

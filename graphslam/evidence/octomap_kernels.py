@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import callee
 from graphslam.evidence.cube_kernels import child_state, voxel_state
 from graphslam.evidence.kernels import kernel
 
@@ -125,7 +126,7 @@ def read_tree(records, low, high, bricks, brick_values, cubes):
 # our root (m = top = 2·levels + 2) contain one such octant each, because our root is centred on a corner of theirs.
 
 
-@kernel()
+@callee
 def child_of(m, node, part, i, levels, children):
     """Child i of a node of the octree as (id, part)."""
     ix, iy, iz = i & 1, (i >> 1) & 1, i >> 2
@@ -142,7 +143,7 @@ def child_of(m, node, part, i, levels, children):
     return np.int64(children[node, (z << 4) | (y << 2) | x]), 0
 
 
-@kernel()
+@callee
 def tree_node_state(m, node, part, levels, children, states):
     """State of a node of the octree, and its largest known value if ``states`` has maxima."""
     if node == 0 or m == 3 or m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
@@ -159,7 +160,7 @@ def tree_node_state(m, node, part, levels, children, states):
     return state, largest
 
 
-@kernel()
+@callee
 def write_brick(row, order, classes, threshold, record, records):
     """Write the records of a mixed brick ``row (512,)``, from index ``record`` on; returns the index after the last.
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.errors import GridError
-from graphslam.evidence.jit_notice import announce_compilation
 from graphslam.evidence.layout import BRICK_VOXELS, CHILDREN, DEFAULT_LEVELS, MAX_LEVELS, UNKNOWN, half_edge
 from graphslam.evidence.scratch import Scratch, aligned_empty, aligned_zeros
 from graphslam.evidence.tree_kernels import (
@@ -61,7 +60,6 @@ class GridPool:
     def __init__(self, levels: int = DEFAULT_LEVELS) -> None:
         if not (isinstance(levels, int) and 2 <= levels <= MAX_LEVELS):
             raise GridError("impossible number of tree levels", got=levels, wanted=f"2 … {MAX_LEVELS}")
-        announce_compilation()
         self.levels = levels
         self.half = half_edge(levels)
         self.lock = threading.RLock()

@@ -10,10 +10,11 @@ import math
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 
-@kernel()
+@callee
 def find_brick(root, x, y, z, levels, children, last):
     """Brick that contains voxel (x, y, z) [offset coordinates], or 0.
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
@@ -54,14 +55,14 @@ class Tree(NamedTuple):
     half: int
 
 
-@kernel()
+@callee
 def child_index(bx, by, bz, level):
     """Index of the child that contains a brick, in a node of level ``level``."""
     s = 2 * level
     return (((bz >> s) & 3) << 4) | (((by >> s) & 3) << 2) | ((bx >> s) & 3)
 
 
-@kernel()
+@callee
 def take_node(children, node_ref, node_occupied, node_free, counters):
     """Allocate an empty node with one parent."""
     if counters[NODES_FREE] > 0:
@@ -77,7 +78,7 @@ def take_node(children, node_ref, node_occupied, node_free, counters):
     return n
 
 
-@kernel()
+@callee
 def take_brick(brick_ref, brick_free, counters):
     """Allocate a brick with one parent; its voxels are not initialised."""
     if counters[BRICKS_FREE] > 0:
@@ -90,7 +91,7 @@ def take_brick(brick_ref, brick_free, counters):
     return b
 
 
-@kernel()
+@callee
 def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Copy a node. The copy has one parent, the source one parent less, the children one more."""
     n = take_node(children, node_ref, node_occupied, node_free, counters)
@@ -107,7 +108,7 @@ def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node
     return n
 
 
-@kernel()
+@callee
 def own_child(node, c, level, tree):
     """Child of an unshared node, made unshared too: created if missing, copied if shared.
 
@@ -127,7 +128,7 @@ def own_child(node, c, level, tree):
     return child
 
 
-@kernel()
+@callee
 def find_node(root, bx, by, bz, levels, children):
     """Node of level 0 that contains a brick, or 0."""
     node = root
@@ -140,7 +141,7 @@ def find_node(root, bx, by, bz, levels, children):
     return node
 
 
-@kernel()
+@callee
 def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
     """Set whether a brick contains an occupied voxel, in all nodes on its path, which must be unshared."""
     path = np.empty(8, np.int64)
@@ -181,7 +182,7 @@ def unique_roots(roots, levels, children, node_ref, node_occupied, brick_ref, no
             node_ref[old] += 1
 
 
-@kernel()
+@callee
 def drop_brick(brick, brick_ref, brick_free, counters):
     """Decrease the parent count of a brick; free it at 0."""
     brick_ref[brick] -= 1
@@ -272,7 +273,7 @@ def read_values(root, points, scale, half, levels, children, bricks, out):
         out[k] = bricks[b, ((l & 7) << 6) | ((j & 7) << 3) | (i & 7)]
 
 
-@kernel()
+@callee
 def occupied_lines(brick, threshold, bricks):
     """Bits of the lines of a brick that contain an occupied voxel."""
     lines = 0

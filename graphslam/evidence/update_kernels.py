@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 from graphslam.evidence.prefetch_kernels import prefetch
 from graphslam.evidence.tree_kernels import clone_node, drop_brick, set_occupied, take_brick, take_node
@@ -19,7 +20,7 @@ PENDING = 4
 """Index in the counters of a pool: 1 while an update is between its phases and its trees are not valid."""
 
 
-@kernel()
+@callee
 def find_identical_write(s, source, marks64, table, made, made_marks):
     """Row in ``made`` of the brick with this source and these marks; a new last row if there is none, -1 if ``made``
     is full.
@@ -153,7 +154,7 @@ def resolve_writes(
     counters[PENDING] = 1
 
 
-@kernel()
+@callee
 def _fetch(s, marks64, work, bricks):
     """Prefetch the lines of a slot's bricks that will be read or written."""
     source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
@@ -168,7 +169,7 @@ def _fetch(s, marks64, work, bricks):
             prefetch(bricks, target, 32 * line)
 
 
-@kernel()
+@callee
 def carry_flag(s, root, lines, levels, slot_key, work, children, node_occupied):
     """If the occupancy flag of a slot's brick changed, update the flags on its path in the tree."""
     bit = (node_occupied[work[s, 0]] >> np.uint64(work[s, 1])) & np.uint64(1)

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-@njit
+@callee
 def inverse_left_jacobian_kernel(d: float) -> tuple[float, float, float]:
     """``a``, ``b``, ``da/dd`` of ``V(d)⁻¹ = a I - b S`` (:mod:`graphslam.core.charts`)."""
     h = 0.5 * d
@@ -70,7 +70,7 @@ class SubmapTerms(NamedTuple):
     """(3 + 2n,): ``H(X) - z`` (eq. 15) in its parametrisation."""
 
 
-@njit
+@callee
 def submap_terms(
     ends: tuple[Array, Array], points: Array, rows: Index, z: Array, places: int, group: bool, out: SubmapTerms
 ) -> tuple[float, float, float, float, float, float]:
@@ -106,7 +106,7 @@ def submap_terms(
     return va, vb, ca, sa, np.cos(end[2] - start[2]), np.sin(end[2] - start[2])
 
 
-@njit
+@callee
 def times_submap_jacobian(
     L: Array, terms: SubmapTerms, turns: tuple[float, float, float, float, float, float], places: int, M: Array
 ) -> None:

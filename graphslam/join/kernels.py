@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ class BlockMap(NamedTuple):
     value: Array
 
 
-@njit
+@callee
 def _begin_of(width: Index) -> Index:
     """Offset of each node among the scalars, and their total ``(N + 1,)``."""
     at = np.zeros(len(width) + 1, np.int64)
@@ -272,7 +272,7 @@ def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, valu
     return out
 
 
-@njit
+@callee
 def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
     """``a, b`` of V⁻¹ and the column of the anchor's heading ``(N, 4)`` of each node at x; gradient ``Jᵀ I u``."""
     mean, width, ptr, idx, block, value = m
@@ -310,7 +310,7 @@ def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
     return arc, gradient
 
 
-@njit
+@callee
 def _nodes_on_poses(anchor: Index) -> tuple[Index, Index]:
     """Nodes with anchor i: ``hanging[begin[i] : begin[i + 1]]``."""
     N = len(anchor)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
@@ -216,7 +216,7 @@ U, D, H, WU, WD, WH = range(6)
 Jacobian's columns of the start's and the end's heading, and the products of the three with Ω."""
 
 
-@njit
+@callee
 def _fill_columns(r: Array, z: Array, group: bool, rows: Array) -> tuple[float, float]:
     """Residual and columns of a submap with Cartesian residual r; ``a, b`` of V⁻¹."""
     va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
@@ -234,7 +234,7 @@ def _fill_columns(r: Array, z: Array, group: bool, rows: Array) -> tuple[float, 
     return va, vb
 
 
-@njit
+@callee
 def _weigh_columns(W: Array, c: float, s: float, rows: Array, turned: Array) -> tuple[float, float, float]:
     """Products with Ω, rotated by ``T = [c, -s; s, c]``: ``T Ω Tᵀ`` and ``T Ω`` times the columns; rᵀΩr, dᵀΩr, dᵀΩd."""
     n = len(W)
@@ -274,7 +274,7 @@ def _weigh_columns(W: Array, c: float, s: float, rows: Array, turned: Array) -> 
     return rr, dr, dd
 
 
-@njit
+@callee
 def _add_entries(slots: Index, at: Index, rows: Array, turned: Array, g: Array, value: Array) -> tuple[float, float]:
     """Add gradient and blocks of a submap's entries, with offsets ``at``; returns the sum of their gradients."""
     gx, gy = 0.0, 0.0
@@ -296,7 +296,7 @@ def _add_entries(slots: Index, at: Index, rows: Array, turned: Array, g: Array, 
     return gx, gy
 
 
-@njit
+@callee
 def _add_start(slots: Index, rows: Array, turned: Array, dd: float, value: Array) -> None:
     """Add the block of a submap's start, and its blocks with every entry: translation, then heading."""
     entries = len(slots) - 1

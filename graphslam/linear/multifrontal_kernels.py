@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.linear.product_kernels import BLOCK, subtract_product
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ LARGE = 64
 """Fronts with at least this number of rows use block products."""
 
 
-@njit
+@callee
 def _earlier(position: Index, ptr: Index, idx: Index) -> tuple[Index, Index]:
     """For every position its neighbours at earlier positions, from lists that contain each pair at least once."""
     N = len(position)
@@ -47,7 +47,7 @@ def _earlier(position: Index, ptr: Index, idx: Index) -> tuple[Index, Index]:
     return start, out
 
 
-@njit
+@callee
 def _tree(start: Index, earlier: Index) -> Index:
     """Elimination tree: parent position or -1 (path compression through ``ancestor``)."""
     N = len(start) - 1
@@ -65,7 +65,7 @@ def _tree(start: Index, earlier: Index) -> Index:
     return parent
 
 
-@njit
+@callee
 def _postorder(parent: Index) -> Index:
     """Positions in postorder: children before their parent, each subtree contiguous."""
     N = len(parent)
@@ -97,7 +97,7 @@ def _postorder(parent: Index) -> Index:
     return order
 
 
-@njit
+@callee
 def _columns(
     start: Index, earlier: Index, turned: tuple[Index, Index], up: Index, offset: Index
 ) -> tuple[Index, Index, Index, Index, int]:
@@ -144,7 +144,7 @@ def _columns(
     return count, scalars, below_ptr, below, int(entries)
 
 
-@njit
+@callee
 def _supernodes(up: Index, offset: Index, scalars: Index, slack: int) -> tuple[Index, Index]:
     """Supernode of each position, and the first position of each."""
     N = len(up)
@@ -257,7 +257,7 @@ def analyse_blocks(
     return new_order, offset, first, above, row_ptr, rows, panel_ptr, sizes
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
     """Cholesky of the columns ``first`` to ``end`` of a front with ``r`` rows, among themselves."""
     for c in range(first, end):
@@ -276,7 +276,7 @@ def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
     return 0
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _eliminate(F: Array, w: int, r: int) -> int:
     """Partial Cholesky of the first ``w`` of ``r`` columns of a front, ``F[c, i]`` = row i ≥ c of column c."""
     if r >= LARGE:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.linear.multifrontal_kernels import LARGE
 from graphslam.linear.product_kernels import BLOCK, subtract_product
 
@@ -102,7 +102,7 @@ class FactorPanels(NamedTuple):
     L: Array
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _solve_upper(P: Array, X: Array, first: int, end: int) -> None:
     """``X ← L⁻ᵀ X`` for the columns ``first`` to ``end`` of a panel, and the same rows of ``X`` ``(w, m)``."""
     for c in range(end - 1, first - 1, -1):

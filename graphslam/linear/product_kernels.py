@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee
 
 Array = npt.NDArray[np.float64]
 
@@ -17,7 +17,7 @@ BLOCK = 64
 """Rows and columns per block."""
 
 
-@njit
+@callee
 def _pack(A: Array, out: Array) -> None:
     """Pack blocks of columns of ``A`` ``(k, n)`` contiguously, row-major within a block."""
     k, n = A.shape
@@ -30,7 +30,7 @@ def _pack(A: Array, out: Array) -> None:
             at += m
 
 
-@njit
+@callee
 def subtract_product(A: Array, B: Array, C: Array, upper: bool) -> None:
     """``C ← C - Aᵀ B`` for ``A`` ``(k, m)``, ``B`` ``(k, n)``, ``C`` ``(m, n)``.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -30,7 +30,7 @@ class PlanePairs(NamedTuple):
     j: Index
 
 
-@njit
+@callee
 def symmetric_eigen(A: Array, w: Array, V: Array) -> None:
     """Eigenvalues ``w`` (ascending) and eigenvectors (columns of ``V``) of a small symmetric matrix.
 
@@ -76,7 +76,7 @@ def symmetric_eigen(A: Array, w: Array, V: Array) -> None:
             j -= 1
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _covariance(points: Array, rows: Index, mean: Array, C: Array) -> int:
     """Covariance ``C`` of the points in ``rows`` (-1: none), divided by their number, which is returned."""
     d = points.shape[1]
@@ -154,15 +154,13 @@ def fit_surfaces(
             out_tilt[k] = 0.0
             continue
         symmetric_eigen(C, w, V)
-        out_normal[k] = V[:, 0]
+        for v in range(d):
+            out_normal[k, v] = V[v, 0]
         for u in range(1, d):
             sigma = np.sqrt(max(w[0], 0.0) / ((n - d) * max(w[u], 1e-12)))
             for v in range(d):
                 out_tilt[k, u - 1, v] = sigma * V[v, u]
-        if d == 3:
-            out_flat[k] = w
-        else:
-            out_flat[k, 0], out_flat[k, 1], out_flat[k, 2] = w[0], w[0], w[1]
+        out_flat[k, 0], out_flat[k, 1], out_flat[k, 2] = w[0], w[d - 2], w[d - 1]
 
 
 @njit(fastmath={"contract"})
@@ -224,7 +222,7 @@ def no_noise_correction(dim: int) -> GroupInformation:
     )
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def normal_jacobian(x: Array, n: Array, out: Array) -> None:
     """Derivative of ``nᵀ y`` by a motion about the origin of a point that is at ``x``, in the order of a tangent."""
     if len(x) == 3:
@@ -288,7 +286,7 @@ def group_information(
                         F[m, u, v] += L * J[u] * J[v]
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array) -> None:
     """Convert a derivative by a motion about a centre (world frame) to one by the right tangent of a pose."""
     d = len(t)
@@ -306,7 +304,7 @@ def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array)
         out[2] = sign * (K[2] - ((t[0] - centre[0]) * K[1] - (t[1] - centre[1]) * K[0]))
 
 
-@njit(fastmath={"contract"})
+@callee(fastmath={"contract"})
 def _share_of(share: Array, m: int, J: Array, out: Array) -> None:
     """``out = share[m] J``."""
     for u in range(len(J)):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 
 @njit(nogil=True)
@@ -110,7 +110,7 @@ def local_maxima(weights):
     return found[:n]
 
 
-@njit(nogil=True)
+@callee
 def is_maximum(weights, a, k, j, i):
     """Whether no neighbour of element ``[a, k, j, i]`` is larger, or equal and earlier in the array."""
     na, nz, ny, nx = weights.shape

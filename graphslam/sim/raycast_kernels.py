@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 _LEAF = 4  # triangles of a leaf
@@ -20,7 +21,7 @@ _DEPTH = 128
 _MARGIN = 1e-9  # relative to the size of the mesh: enlargement of a box, and tolerance at the edges of a triangle
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _half_area(low, high):
     a, b, c = high[0] - low[0], high[1] - low[1], high[2] - low[2]
     return a * b + b * c + c * a
@@ -108,7 +109,7 @@ def build_kernel(low, high, boxes, first, count, order):
     return nodes
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _enters(box, x, y, z, ix, iy, iz, until):
     """Where a ray with inverse direction enters a box; infinite if it does not before ``until``."""
     t0, t1 = (box[0] - x) * ix, (box[3] - x) * ix
@@ -120,7 +121,7 @@ def _enters(box, x, y, z, ix, iy, iz, until):
     return near if near <= far and near < until else math.inf
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _inverse(d):
     # a finite number instead of infinity, because 0 × ∞ is undefined
     return 1.0 / d if abs(d) > 1e-200 else 1e200
@@ -176,7 +177,7 @@ def ranges_kernel(rays, boxes, first, count, triangles, out):
         out[r] = best
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _box_distance2(box, x, y, z):
     a = max(box[0] - x, x - box[3], 0.0)
     b = max(box[1] - y, y - box[4], 0.0)
@@ -184,7 +185,7 @@ def _box_distance2(box, x, y, z):
     return a * a + b * b + c * c
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _segment_distance2(wx, wy, wz, ex, ey, ez):
     """Squared distance from w, relative to the segment's start, to the segment e."""
     length2 = ex * ex + ey * ey + ez * ez
@@ -193,7 +194,7 @@ def _segment_distance2(wx, wy, wz, ex, ey, ez):
     return a * a + b * b + c * c
 
 
-@kernel(error_model="numpy")
+@callee(error_model="numpy")
 def _triangle_distance2(t, x, y, z):
     wx, wy, wz = x - t[0], y - t[1], z - t[2]
     ee = t[3] * t[3] + t[4] * t[4] + t[5] * t[5]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 
 class BlockTable(NamedTuple):
@@ -37,7 +37,7 @@ def make_block_table(capacity):
     )
 
 
-@njit(nogil=True)
+@callee
 def _find(table, key):
     """Index of a block; a missing one is added."""
     mask = len(table.key) - 1
@@ -52,7 +52,7 @@ def _find(table, key):
     return table.place[at]
 
 
-@njit(nogil=True)
+@callee
 def _grown(table):
     """The table with twice the capacity."""
     n = table.filled[0]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class ChainArrays(NamedTuple):
     """(1,) or (N,): its information [1/rad²]; zero if not measured."""
 
 
-@njit(nogil=True)
+@callee
 def _log(R, r):
     """Rotation vector of a rotation matrix, below half a turn."""
     c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -45,7 +45,7 @@ def _log(R, r):
     r[0], r[1], r[2] = k * x, k * y, k * z
 
 
-@njit(nogil=True)
+@callee
 def write_se3_exp(w, R):
     """Write ``Exp(w)`` to ``R (3, 3)``."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -96,7 +96,7 @@ def compose_odometry(rotation, translation, R, p):
                 )
 
 
-@njit(nogil=True)
+@callee
 def odometry_residual(chain, poses, k, r, J):
     """Residual (6,) of odometry k and the left half (6, 6) of its Jacobian with respect to pose k + 1.
 
@@ -135,7 +135,7 @@ def odometry_residual(chain, poses, k, r, J):
     return dx, dy, dz
 
 
-@njit(nogil=True)
+@callee
 def _sandwich(X, P, Y, M, row, column):
     """Write ``Xᵀ P Y`` of three (3, 3) to a corner of ``M``."""
     for i in range(3):
@@ -238,7 +238,7 @@ def chain_product(diagonal, upper, v, begin, end, out):
                     out[i, r] += upper[i - 1, c, r] * v[i - 1, c]
 
 
-@njit(nogil=True)
+@callee
 def _cholesky(A):
     """Lower Cholesky factor in place of a block (6, 6); False if it is not positive definite."""
     for j in range(6):
@@ -257,7 +257,7 @@ def _cholesky(A):
     return True
 
 
-@njit(nogil=True)
+@callee
 def _solve(L, x):
     for i in range(6):
         s = x[i]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.skeleton.block_table_kernels import _find, _grown
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
@@ -51,7 +51,7 @@ def make_pending(landmarks):
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@callee(error_model="numpy")
 def _sum_interval(detections, poses, interval, slot, ids, sums):
     """Sums over the poses of one interval, one row per observed landmark; ``slot`` is initially zero.
 
@@ -129,7 +129,7 @@ def _interval(c, k, N):
     return a, b, N if b == N - 1 else b
 
 
-@njit(nogil=True)
+@callee
 def _most(first, k, N, begin, end):
     """Largest number of measurements of an interval in ``begin … end - 1``."""
     most = 1
@@ -139,7 +139,7 @@ def _most(first, k, N, begin, end):
     return most
 
 
-@njit(nogil=True)
+@callee
 def _weighted(S, qx, qy, qz, X):
     """``X = S G`` (3, 6), G = [[q]×, -I], of a symmetric S (six values)."""
     for r in range(3):
@@ -155,7 +155,7 @@ def _weighted(S, qx, qy, qz, X):
         X[r, 3], X[r, 4], X[r, 5] = -a, -b, -c
 
 
-@njit(nogil=True)
+@callee
 def _add_lever(qx, qy, qz, X, sign, B):
     """``B += sign · Gᵀ X``, G = [[q]×, -I]."""
     for c in range(6):
@@ -241,7 +241,7 @@ def keyframe_diagonal(detections, poses, landmarks, k, begin, end, out):
         n0 = n1
 
 
-@njit(nogil=True)
+@callee
 def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
     """Subtract ``S D⁻¹ S`` of a landmark for all pairs of its keyframes (entries ``chain``)."""
     l, Di = landmark
@@ -359,7 +359,7 @@ def keyframe_network(detections, poses, landmarks, k, span, count, waiting, tabl
     return PendingLandmarks(slot, head, frame, after, kept, ends), table
 
 
-@njit(nogil=True)
+@callee
 def _subtract(X, Y, B):
     """``B -= Xᵀ Y`` of two (3, 6)."""
     for r in range(6):
@@ -368,7 +368,7 @@ def _subtract(X, Y, B):
             B[r, c] -= x * Y[0, c] + y * Y[1, c] + z * Y[2, c]
 
 
-@njit(nogil=True)
+@callee
 def _longer(frame, after, kept, room):
     n = len(frame)
     f, a, s = np.empty(room, np.int32), np.empty(room, np.int32), np.empty((room, 6))
@@ -376,14 +376,14 @@ def _longer(frame, after, kept, room):
     return f, a, s
 
 
-@njit(nogil=True)
+@callee
 def _doubled(values):
     out = np.empty(2 * len(values), np.int32)
     out[: len(values)] = values
     return out
 
 
-@njit(nogil=True)
+@callee
 def _carried(A, left, right, h, T):
     """``T = h · Cₗᵀ A Cᵣ`` with C = [[I, 0], [-[d]×, I]] for the offsets ``left`` and ``right`` from a keyframe."""
     M = np.empty((6, 6))
@@ -437,7 +437,7 @@ def keyframe_chain(position, diagonal, upper, k, out_diagonal, out_upper):
                     out_upper[c, r, s] += T[s, r]
 
 
-@njit(nogil=True)
+@callee
 def _both(T, B):
     for r in range(6):
         for c in range(6):

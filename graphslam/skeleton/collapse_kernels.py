@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 
-@njit(nogil=True)
+@callee
 def _root(parent, i):
     """First member of the set of ``i``, with path halving."""
     while parent[i] != i:

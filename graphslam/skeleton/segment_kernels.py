@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.skeleton.chain_kernels import Array, _cholesky, _log, _solve
 from graphslam.skeleton.landmark_kernels import _nine
 
@@ -38,7 +38,7 @@ class SegmentLinks(NamedTuple):
     """Its inverse."""
 
 
-@njit(nogil=True, error_model="numpy")
+@callee(error_model="numpy")
 def _residual(links, e, turns, shift, scratch, r):
     """Write the residual (6,) of link e between two rotations, p_j - p_i = ``shift`` in the world."""
     Ra, Rb = turns
@@ -57,7 +57,7 @@ def _residual(links, e, turns, shift, scratch, r):
         r[3 + i] = Ra[i] * dx + Ra[3 + i] * dy + Ra[6 + i] * dz - links.translation[e, i]
 
 
-@njit(nogil=True, error_model="numpy")
+@callee(error_model="numpy")
 def _turned(Rb, r, B):
     """Write ``R_j J_r(r)`` (3, 3), J_r the right Jacobian of the rotation residual."""
     x, y, z = r[0], r[1], r[2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam.skeleton.chain_kernels import _cholesky, _log, _solve, write_se3_exp
 
 
@@ -182,7 +182,7 @@ def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, 
     return aligned, refused
 
 
-@njit(nogil=True)
+@callee
 def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
     """Add ``Jᵀ W J``, J = [[q]× , -I], to a block (6, 6)."""
     al, be = weight

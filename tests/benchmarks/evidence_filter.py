@@ -184,13 +184,6 @@ def _draw(png: Path, used: Array, one: Array, particles: int) -> None:
     figure.savefig(png, dpi=150)
 
 
-_COMPILE = """
-import time
-begin = time.perf_counter(), time.process_time()
-from graphslam.evidence.compile import compile_kernels
-compile_kernels()
-print(time.perf_counter() - begin[0], time.process_time() - begin[1])
-"""
 _START = """
 import time
 import numpy as np
@@ -204,8 +197,8 @@ print(time.perf_counter() - begin[0], time.process_time() - begin[1])
 
 
 def start_up(compiled: int) -> tuple[float, float]:
-    """Seconds from the first import to every kernel compiled, in a fresh process and its helper; CPU seconds from
-    NumPy imported to a grid made, a scan inserted and a beam cast, in a process that finds them compiled. The least of
+    """Wall seconds from NumPy imported to a grid made, a scan inserted and a beam cast, in a process that compiles
+    what that needs; CPU seconds in a process that finds it compiled. The least of
     ``compiled`` repetitions; of none, kernels are those that this machine has compiled before, and the first is NaN.
     """
     if not compiled:
@@ -215,13 +208,11 @@ def start_up(compiled: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         cold = []
         for k in range(compiled):
-            cold.append(_child(_COMPILE, f"{folder}/{k}"))
+            cold.append(_child(_START, f"{folder}/{k}"))
         warm = min(_child(_START, f"{folder}/0")[1] for _ in range(compiled + 2))
         megabytes = sum(p.stat().st_size for p in Path(folder, "0").rglob("*") if p.is_file()) / 1e6
     wall = min(w for w, _ in cold)
-    print(
-        f"start: compiling everything {wall:.2f} s, {megabytes:.1f} MB kept; compiled before {warm:.2f} s", flush=True
-    )
+    print(f"start: compiling {wall:.2f} s, {megabytes:.1f} MB kept; compiled before {warm:.2f} s", flush=True)
     return wall, warm
 
 

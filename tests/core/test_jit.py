@@ -32,7 +32,7 @@ if __name__ == "__main__":
 def compile_kernel(folder: Path, **environment: str) -> tuple[str, str]:
     """What a process that compiles two functions of a module in the folder prints on stdout and stderr."""
     (folder / "kernel.py").write_text(KERNEL)
-    env = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", jit.COMPILING)}
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     env |= {"XDG_CACHE_HOME": str(folder / "home"), **environment}
     done = subprocess.run([sys.executable, "kernel.py"], cwd=folder, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -169,3 +169,16 @@ def test_all_versions_are_cleared_but_not_a_folder_of_the_user(root: Path, monke
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(own.parent))
     jit.clear_compiled_code()
     assert own.exists()
+
+
+def test_a_function_that_only_kernels_call_has_no_file_and_runs_in_python(tmp_path: Path) -> None:
+    (tmp_path / "called.py").write_text(
+        "import gc\n"
+        "from graphslam.core.jit import callee, compiled_code, njit\n\n\n"
+        "@callee\ndef half(x):\n    return x / 2\n\n\n"
+        "@njit\ndef quarter(x):\n    return half(half(x))\n\n\n"
+        "print(quarter(8), half(8), compiled_code()[0], gc.isenabled())\n"
+    )
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "home")}
+    done = subprocess.run([sys.executable, "called.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.stdout == "2.0 4.0 1 True\n", done.stderr

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 # columns of the result
 SCAN, RANGE, BEARING, RADIUS, VAR_RANGE, VAR_BEARING, BEAMS, FITTED = range(8)
@@ -22,7 +22,7 @@ _FIT_GATE = 9.0
 _MAX_ITERATIONS = 20
 
 
-@njit
+@callee
 def _clusters(r, angles, max_range, jump, missing, first, last, ends):  # type: ignore[no-untyped-def]
     """Split the returns of one scan; fills first/last beam and the end points (x0, y0, x1, y1) of each cluster."""
     count = 0
@@ -42,7 +42,7 @@ def _clusters(r, angles, max_range, jump, missing, first, last, ends):  # type: 
     return count
 
 
-@njit
+@callee
 def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
     """Are all other clusters farther than ``distance`` (their last point to this first one, and vice versa)?"""
     d2 = distance * distance
@@ -58,7 +58,7 @@ def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit
+@callee
 def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
     """Mean range of the one or two returns nearest to the middle of beams a..b, and their number."""
     best, total, used = 2 * (b - a) + 2, 0.0, 0
@@ -74,7 +74,7 @@ def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
     return total / used, used
 
 
-@njit
+@callee
 def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-untyped-def]
     """Weighted least squares of (rho, bearing, radius) on both edge angles and the ranges of the inner beams.
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam_frontends.landmarks.ekf_kernels import linearise_observation
 from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
@@ -114,7 +114,7 @@ def nearest_kernel(pairs, pair_o, pair_k, cost, match):
                 used[i] = True
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _levels(pair_o, count, observations):
     """First and end index of the pairings of each observation with a candidate, and the number of such observations."""
     begin, end = np.empty(observations, np.int64), np.empty(observations, np.int64)
@@ -127,7 +127,7 @@ def _levels(pair_o, count, observations):
     return begin, end, levels
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _linearise_pairings(x, obs, sensor, pair_o, pair_k, count):
     """Jacobian, innovation and number of rows of each pairing, and the largest landmark index."""
     H, nu, rows = np.empty((count, 2, 5)), np.empty((count, 2)), np.empty(count, np.int64)
@@ -235,7 +235,7 @@ def _hand_over(best_match, match, nodes, capped, d2):
     return nodes, capped, d2 if d2 < np.inf else 0.0
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _cross(P, a, ca, b, cb):
     """``a P bᵀ`` for two rows over [pose, landmark at column ca or cb]."""
     total = 0.0

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
 
@@ -77,7 +77,7 @@ def predict_kernel(x, P, n, Phi, n0, u, Q):
             P[j, i] = P[i, j]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def linearise_observation(x, k, row, sensor, h, H, nu):
     """Jacobian rows H (2, 5) over [x, y, θ, l_x, l_y] and innovation nu (2,) of active landmark k; returns 1 or 2.
 

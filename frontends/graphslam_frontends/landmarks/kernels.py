@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam_frontends.landmarks.measurement_kernels import (
     TWO_PI,
     inverse_innovation,
@@ -117,7 +117,7 @@ class _Pairing(NamedTuple):
     pair_c: Any
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _choose(n_pairs, pair_o, pair_s, pair_c, match):
     """Greedy by likelihood, each observation and each landmark at most once; overwrites ``pair_o``."""
     while True:
@@ -134,7 +134,7 @@ def _choose(n_pairs, pair_o, pair_s, pair_c, match):
                 pair_o[i] = -1
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     """Maximum-likelihood association of one particle, exclusive (B4, step 2): fills match[o] with a slot or -1.
 

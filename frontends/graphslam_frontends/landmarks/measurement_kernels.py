@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 TWO_PI = 2.0 * math.pi
 LOG_2PI = math.log(TWO_PI)
@@ -22,7 +22,7 @@ def wrap_angle_kernel(a):
     return math.pi - (math.pi - a) % TWO_PI
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def observe_landmark(x, y, th, sensor, lx, ly, out):
     """Range, bearing and their Jacobians for a landmark (lx, ly) from pose (x, y, th) with ``sensor (3,)``.
 
@@ -67,7 +67,7 @@ def landmark_block(h, c0, c1, c2):
     return a0 * h[8] + a1 * h[9], a0 * h[10] + a1 * h[11], b0 * h[10] + b1 * h[11]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def pose_update(m, P, h, nu0, nu1, i00, i01, i11):
     """EKF update of the proposal Gaussian (mean pose m, right-tangent covariance P) by one observation."""
     G = np.empty((3, 2))
@@ -96,7 +96,7 @@ def retract_pose(m, dx, dy, dth):
     m[2] = wrap_angle_kernel(m[2] + dth)
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def cholesky3(P, L):
     """Lower Cholesky factor of a 3×3 covariance; a direction without variance gets a zero column."""
     L[:] = 0.0
@@ -111,7 +111,7 @@ def cholesky3(P, L):
                 L[i, j] = s / L[j, j]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def sample_pose(m, P, z, L):
     """``m ← m ∘ L z`` with P = L Lᵀ and z standard normal."""
     cholesky3(P, L)

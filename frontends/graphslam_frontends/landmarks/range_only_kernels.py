@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam_frontends.landmarks.measurement_kernels import LOG_2PI, TWO_PI
 
 STARTS = 16
@@ -21,7 +21,7 @@ FIT_X, FIT_Y, FIT_XX, FIT_XY, FIT_YY, FIT_CHI2, FIT_MARGIN, FIT_LOG_LIKELIHOOD, 
 FIT_LENGTH = 10
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _normal(x, y, anchors, ranges, variances, limit, out):
     """Truncated χ² Σ min(d², limit) at (x, y); out: gradient (2), Gauss-Newton matrix (xx, xy, yy), inliers.
 
@@ -51,7 +51,7 @@ def _normal(x, y, anchors, ranges, variances, limit, out):
     return cost
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _descend(p, anchors, ranges, variances, limit, n):
     """Damped Gauss-Newton from p, in place; returns the truncated χ²; n holds the normal equations at the end."""
     damping = 1e-3

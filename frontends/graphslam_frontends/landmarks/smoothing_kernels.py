@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
 
@@ -52,7 +52,7 @@ class NormalBlocks(NamedTuple):
     """(2 L,): that of the landmarks."""
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def bound_bearing_slopes(h, variance):
     """Bound the derivatives of a bearing, 1/r, if the landmark is nearer than the σ of the range."""
     near = math.sqrt(variance)
@@ -62,7 +62,7 @@ def bound_bearing_slopes(h, variance):
         h[10], h[11] = share * h[10], share * h[11]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _inverse3(A):
     """Inverse of a symmetric 3×3 matrix by cofactors."""
     out = np.empty((3, 3))
@@ -80,7 +80,7 @@ def _inverse3(A):
     return out
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _odometry_residual(a, b, u, e):
     """``e = u⁻¹ ∘ (a⁻¹ ∘ b)`` as (x, y, θ), and the between pose a⁻¹ ∘ b in e[3:6]."""
     c, s = math.cos(a[2]), math.sin(a[2])
@@ -118,7 +118,7 @@ def smoothing_cost(poses, landmarks, evidence, d2, parts):
     return total
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _linearise(poses, landmarks, evidence, normal):
     """Fill the normal equations."""
     u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
@@ -178,7 +178,7 @@ def _linearise(poses, landmarks, evidence, normal):
                 H[2 * j + r_, 2 * j + q] += a0 * h[8 + q] + a1 * h[10 + q]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _eliminate(normal, last_seen, Ainv):
     """Eliminate poses 0 … T-2 forwards. Columns of C beyond ``last_seen[k]`` are still zero at pose k."""
     A, B, C, H, g, gl = normal
@@ -206,7 +206,7 @@ def _eliminate(normal, last_seen, Ainv):
                     H[r, q] -= c0 * G[0, q] + c1 * G[1, q] + c2 * G[2, q]
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _reduced(A, C, H):
     """Information matrix of {exit pose, landmarks} after the elimination."""
     T, n = len(A), H.shape[0]
@@ -273,7 +273,7 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
     return cost, max_iterations, False
 
 
-@njit
+@callee
 def observed_columns(T, n, ob_pose, ob_lm):
     """last_seen[k]: number of leading landmark columns of poses 0 … k (landmarks in order of first observation)."""
     out = np.zeros(T, np.int64)
@@ -287,7 +287,7 @@ def observed_columns(T, n, ob_pose, ob_lm):
     return np.minimum(out, n)
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _at_optimum(poses, landmarks, evidence):
     """The elimination ``(Ainv, B, C)`` at the optimum, and the joint covariance of {exit pose, landmarks}."""
     T, n = len(poses), 2 * len(landmarks)
@@ -302,7 +302,7 @@ def _at_optimum(poses, landmarks, evidence):
     return Ainv, B, C, joint
 
 
-@njit(error_model="numpy")
+@callee(error_model="numpy")
 def _pose_before(Ainv, B, C, Sl, S, X):
     """One step of the backward recursion: covariance of pose k, and with the landmarks, from those of pose k + 1."""
     # pose k given the rest: -Ainv (B ξ_{k+1} + C l), conditional covariance Ainv

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 F8 = npt.NDArray[np.float64]
 I8 = npt.NDArray[np.int64]
@@ -88,7 +88,7 @@ def _find(c: Cells, key: Any) -> Any:
         h = (h + 1) & mask
 
 
-@njit
+@callee
 def _put(c: Cells, key: Any) -> Any:
     """Block of a cube, created if it is new; -1 if there is no space."""
     mask = len(c.keys) - 1
@@ -112,7 +112,7 @@ def _put(c: Cells, key: Any) -> Any:
     return np.int64(b)
 
 
-@njit
+@callee
 def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
     """A cell became valid or moved: update the cached cubes around it whose nearest cell it is now, or was."""
     key = c.cube[b]
@@ -149,7 +149,7 @@ def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
                             sub += 1
 
 
-@njit
+@callee
 def _eigen(S: F8, V: F8) -> None:
     """Eigenvalues of a symmetric 3 × 3 matrix onto its diagonal, eigenvectors into columns of V (Jacobi)."""
     V[:, :] = 0.0
@@ -179,7 +179,7 @@ def _eigen(S: F8, V: F8) -> None:
                     V[k, p], V[k, q] = cos * a - sin * b, sin * a + cos * b
 
 
-@njit
+@callee
 def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, float]:
     """Principal axes of the points of a cell: variances on the diagonal of S, directions in the columns of V.
 
@@ -195,7 +195,9 @@ def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, fl
     n, s = c.number[b], c.scatter[b]
     S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = s[0], s[1], s[2], s[3], s[4], s[5]
     S[1, 0], S[2, 0], S[2, 1] = s[1], s[2], s[4]
-    S /= n
+    for i in range(3):
+        for j in range(3):
+            S[i, j] /= n
     _eigen(S, V)
     k = 0
     for i in range(1, 3):
@@ -205,7 +207,7 @@ def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, fl
     return k, max(1.0 - S[k, k] / flat, 0.0), min(max(second / flat - 0.5, 0.0), 1.0)
 
 
-@njit
+@callee
 def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells, float]) -> None:
     """Update the cell used for matching from its points so far.
 
@@ -250,7 +252,8 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
         moved = max(moved, abs(c.mean[b, i] - c.centre[b, i]))
     new = c.updated[b] == 0
     c.updated[b] = n
-    c.centre[b, :] = c.mean[b]
+    for i in range(3):
+        c.centre[b, i] = c.mean[b, i]
     if new or moved > 0.25 * size / FINE:
         _enter(c, b, size, new)
 
@@ -305,22 +308,16 @@ def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], 
 
 
 @njit(nogil=True)
-def keep_since(c: Cells, out: Cells, scan: int) -> None:
-    """Copy the cells with points since a scan into an empty level."""
-    for b in range(c.used[0]):
-        if c.seen[b] < scan or c.number[b] == 0:
-            continue
-        k = _put(out, c.cube[b])
-        out.number[k], out.updated[k], out.seen[k], out.made[k] = c.number[b], c.updated[b], c.seen[b], c.made[b]
-        out.mean[k], out.scatter[k], out.centre[k], out.root[k] = (
-            c.mean[b],
-            c.scatter[b],
-            c.centre[b],
-            c.root[b],
-        )
+def enter_keys(keys: I8, slots: I4, cube: I8) -> None:
+    """Enter blocks into an empty hash table."""
+    for b in range(len(cube)):
+        h = np.int64((np.uint64(cube[b]) * _MULTIPLIER) >> np.uint64(20)) & (len(keys) - 1)
+        while keys[h] != -1:
+            h = (h + 1) & (len(keys) - 1)
+        keys[h], slots[h] = cube[b], b
 
 
-@njit
+@callee
 def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
     """Find and store the cell nearest to the centre of a cached cube."""
     if c.n_around[b] < 0:
@@ -393,9 +390,15 @@ def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: floa
         out[r] = total / max(len(points), 1)
 
 
-@njit(nogil=True)
-def cell_normal_equations(
-    c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, sums: F8
+@callee
+def _normal_equations(
+    c: Cells,
+    points: F8,
+    pose: tuple[F8, F8],
+    size: float,
+    scale: float,
+    out: tuple[F8, F8, F8],
+    notes: tuple[I8, I8],
 ) -> None:
     """Gauss–Newton normal equations of points on cells, with Geman–McClure weights.
 
@@ -407,28 +410,13 @@ def cell_normal_equations(
         Rotation and position of the body.
     scale : float
         Mahalanobis distance at which the weight is 1/4.
-    H, g : (6, 6), (6,)
-        Out: right tangent, rotation first; ``H δ = -g``.
-    sums : (13,)
-        Out: sum of weights; number of points with an informative cell; weighted sum of squared Mahalanobis distances;
-        then the sum of weights times traces of information, of these times the points (3), and times their squares (6:
-        xx, xy, xz, yy, yz, zz).
+    out : (6, 6), (6,), (13,)
+        H and g, right tangent, rotation first, ``H δ = -g``; then the sum of weights; number of points with an
+        informative cell; weighted sum of squared Mahalanobis distances; the sum of weights times traces of information,
+        of these times the points (3), and times their squares (6: xx, xy, xz, yy, yz, zz).
+    notes : (n,), (n,)
+        The last cached cube of each point, and its nearest cell.
     """
-    notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
-    _normal_equations(c, points, pose, size, scale, (H, g, sums), notes)
-
-
-@njit
-def _normal_equations(
-    c: Cells,
-    points: F8,
-    pose: tuple[F8, F8],
-    size: float,
-    scale: float,
-    out: tuple[F8, F8, F8],
-    notes: tuple[I8, I8],
-) -> None:
-    """``notes``: the last cached cube of each point, and its nearest cell."""
     (R, t), (H, g, sums), (asked, found) = pose, out, notes
     fine = FINE / size
     H[:, :] = 0.0
@@ -493,7 +481,7 @@ def _normal_equations(
             H[i, j] = H[j, i]
 
 
-@njit
+@callee
 def _rotation(w: F8, R: F8, V: F8) -> None:
     """Rotation matrix of a rotation vector, and its left Jacobian."""
     x = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -512,7 +500,7 @@ def _rotation(w: F8, R: F8, V: F8) -> None:
             V[i, j] = one + b * K[i, j] + d * square
 
 
-@njit
+@callee
 def _log(R: F8, t: F8, out: F8) -> None:
     """Logarithm (6,) of a motion that rotates by less than π."""
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
@@ -527,6 +515,23 @@ def _log(R: F8, t: F8, out: F8) -> None:
     out[3] = t[0] - 0.5 * a[0] + q * (w[1] * a[2] - w[2] * a[1])
     out[4] = t[1] - 0.5 * a[1] + q * (w[2] * a[0] - w[0] * a[2])
     out[5] = t[2] - 0.5 * a[2] + q * (w[0] * a[1] - w[1] * a[0])
+
+
+@callee
+def _solve(A: F8, x: F8) -> None:
+    """Solve in place of x with a positive definite matrix (6, 6), which is overwritten: L D Lᵀ, without a library."""
+    for j in range(6):
+        for i in range(j + 1, 6):
+            k = A[i, j] / A[j, j]
+            for q in range(j + 1, i + 1):
+                A[i, q] -= k * A[q, j]
+            x[i] -= k * x[j]
+        for i in range(j + 1, 6):
+            A[i, j] /= A[j, j]
+    for i in range(5, -1, -1):
+        x[i] /= A[i, i]
+        for j in range(i + 1, 6):
+            x[i] -= A[j, i] * x[j]
 
 
 @njit(nogil=True)
@@ -551,7 +556,7 @@ def descend_pose(
     stop : (float, float, int)
         Convergence threshold of a step [rad], [m]; most steps.
     out : (6, 6), (6,), (13,)
-        As of `cell_normal_equations`, before the last step.
+        As of `_normal_equations`, before the last step.
 
     Returns
     -------
@@ -562,7 +567,7 @@ def descend_pose(
     start_R, start_t, prior = start
     notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
     turn, left = np.empty((3, 3)), np.empty((3, 3))
-    off, d = np.empty(6), np.empty(6)
+    off, d, A = np.empty(6), np.empty(6), np.empty((6, 6))
     dR, dt = np.empty((3, 3)), np.empty(3)
     for step in range(stop[2]):
         if c.used[0] + len(points) > len(c.cube):
@@ -574,20 +579,28 @@ def descend_pose(
                 dt[i] += start_R[j, i] * (t[j] - start_t[j])
                 dR[i, j] = start_R[0, i] * R[0, j] + start_R[1, i] * R[1, j] + start_R[2, i] * R[2, j]
         _log(dR, dt, off)
-        d[:] = -np.linalg.solve(H + prior, g + prior @ off)
+        for i in range(6):
+            d[i] = -g[i]
+            for j in range(6):
+                A[i, j] = H[i, j] + prior[i, j]
+                d[i] -= prior[i, j] * off[j]
+        _solve(A, d)
         # longer steps are unreliable and are cut
         for part, least in ((3, 0.5 * size), (0, 0.2)):
             length = np.sqrt(d[part] ** 2 + d[part + 1] ** 2 + d[part + 2] ** 2)
             if length > least:
-                d *= least / length
+                for i in range(6):
+                    d[i] *= least / length
         _rotation(d[:3], turn, left)
-        u = left @ d[3:]
         for i in range(3):
-            t[i] += R[i, 0] * u[0] + R[i, 1] * u[1] + R[i, 2] * u[2]
+            dt[i] = left[i, 0] * d[3] + left[i, 1] * d[4] + left[i, 2] * d[5]
         for i in range(3):
+            t[i] += R[i, 0] * dt[0] + R[i, 1] * dt[1] + R[i, 2] * dt[2]
             for j in range(3):
                 dR[i, j] = R[i, 0] * turn[0, j] + R[i, 1] * turn[1, j] + R[i, 2] * turn[2, j]
-        R[:, :] = dR
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = dR[i, j]
         turned = np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         if turned < stop[0] and np.sqrt(d[3] ** 2 + d[4] ** 2 + d[5] ** 2) < stop[1]:
             return step + 1
@@ -596,14 +609,14 @@ def descend_pose(
 
 @njit(nogil=True)
 def information_by_slot(
-    c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, ends: F8, out: tuple[F8, F8, F8]
+    c: Cells, points: F8, pose: tuple[F8, F8], scale: float, cells: tuple[I8, I8, I8], out: tuple[F8, F8, F8]
 ) -> None:
     """Gauss–Newton Hessian by the scans that made the cells, and the covariance of the gradient.
 
     Parameters
     ----------
-    ends : (s,)
-        Increasing; a cell belongs to the first slot whose end is not before the mean number of its scans.
+    cells : (n,), (n,), (n,)
+        Cell of each point, negative: none; rows of the points ordered by it; slot of that cell.
     out : (s, 6, 6), (6, 6), (c, 6)
         H by slot, right tangent; covariance M of the gradient for errors common to all points of a cell, with the
         cell's covariance; gradients G of c parts of space, cubes of 8 cells along an edge (by hash, some share a part).
@@ -612,30 +625,23 @@ def information_by_slot(
     H[:, :, :] = 0.0
     M[:, :] = 0.0
     G[:, :] = 0.0
+    at, order, slots = cells
     n = len(points)
-    at = np.empty(n, np.int64)
-    order = np.empty(n, np.int64)
-    for p in range(n):
-        a, b, e = points[p, 0], points[p, 1], points[p, 2]
-        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * e + t[0]
-        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * e + t[1]
-        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * e + t[2]
-        at[p] = _nearest(c, x, y, z, size)
-    order[:] = np.argsort(at)
     inverse = 1.0 / (scale * scale)
     rows = c.root.shape[1]
     r = np.empty(3)
-    J = np.empty((3, 6))
-    S = np.zeros((3, 6))
+    J, S, U = np.empty((3, 6)), np.empty((3, 6)), np.empty((3, 3))
     k = 0
     while k < n:
         cell = at[order[k]]
         if cell < 0:
             k += 1
             continue
-        slot = min(np.searchsorted(ends, c.made[cell]), len(ends) - 1)
+        slot = slots[order[k]]
         W = c.root[cell]
-        U = W @ R
+        for q in range(rows):
+            for i in range(3):
+                U[q, i] = W[q, 0] * R[0, i] + W[q, 1] * R[1, i] + W[q, 2] * R[2, i]
         S[:, :] = 0.0
         # blocks of 8 × 8 × 8 cells
         block = (
@@ -656,9 +662,9 @@ def information_by_slot(
             w = 1.0 / (1.0 + m * inverse)
             w *= w
             for q in range(rows):
-                u = U[q]
-                J[q, 0], J[q, 1], J[q, 2] = b * u[2] - e * u[1], e * u[0] - a * u[2], a * u[1] - b * u[0]
-                J[q, 3], J[q, 4], J[q, 5] = u[0], u[1], u[2]
+                ux, uy, uz = U[q, 0], U[q, 1], U[q, 2]
+                J[q, 0], J[q, 1], J[q, 2] = b * uz - e * uy, e * ux - a * uz, a * uy - b * ux
+                J[q, 3], J[q, 4], J[q, 5] = ux, uy, uz
                 for i in range(6):
                     v = w * J[q, i]
                     S[q, i] += v

@@ -105,9 +105,12 @@ class CellMap:
 
     def _copy(self, scan: int, more: int) -> None:
         c = self.cells
-        kept = int(np.count_nonzero((c.seen[: c.used[0]] >= scan) & (c.number[: c.used[0]] > 0)))
-        out = _empty(2 * (kept + more), c.root.shape[1])
-        kernels.keep_since(c, out, scan)
+        kept = np.flatnonzero((c.seen[: c.used[0]] >= scan) & (c.number[: c.used[0]] > 0))
+        out, n = _empty(2 * (len(kept) + more), c.root.shape[1]), len(kept)
+        for name in ("cube", "number", "mean", "scatter", "updated", "centre", "root", "seen", "made"):
+            getattr(out, name)[:n] = getattr(c, name)[kept]
+        kernels.enter_keys(out.keys, out.slots, out.cube[:n])
+        out.used[0] = n
         self.cells = out
 
     def nearest(self, points: Array) -> npt.NDArray[np.int64]:
@@ -129,10 +132,7 @@ class CellMap:
 
     def fit(self, points: Array, R: Array, t: Array, scale: float) -> NormalEquations:
         """Normal equations of points ``(n, 3)``, body frame, at a pose."""
-        self.room(len(points))
-        out = np.empty((6, 6)), np.empty(6), np.empty(13)
-        kernels.cell_normal_equations(self.cells, points, (R, t), self.config.size, scale, *out)
-        return _fit(len(points), *out)
+        return self.descend(points, R.copy(), t.copy(), scale, np.eye(6), (np.inf, np.inf), 1)
 
     def descend(
         self, points: Array, R: Array, t: Array, scale: float, prior: Array, still: tuple[float, float], most: int
@@ -152,10 +152,15 @@ class CellMap:
         return np.asarray((at >= 0) & (np.abs(self.cells.root[at]).max(axis=(1, 2)) > 0.0))
 
     def by_slot(self, points: Array, R: Array, t: Array, scale: float, ends: Array) -> tuple[Array, Array, Array]:
-        """See `cell_kernels.information_by_slot`: ``(s, 6, 6)``, ``(6, 6)`` and ``(c, 6)``."""
-        self.room(len(points))
+        """See `cell_kernels.information_by_slot`: ``(s, 6, 6)``, ``(6, 6)`` and ``(c, 6)``.
+
+        A cell belongs to the first slot whose end is not before the mean number of its scans.
+        """
+        at = self.nearest(points @ R.T + t)
+        slot = np.minimum(np.searchsorted(ends, self.cells.made[at]), len(ends) - 1)
+        cells = at, np.argsort(at, kind="stable"), slot
         H, M, G = np.empty((len(ends), 6, 6)), np.empty((6, 6)), np.empty((PARTS, 6))
-        kernels.information_by_slot(self.cells, points, (R, t), self.config.size, scale, ends, (H, M, G))
+        kernels.information_by_slot(self.cells, points, (R, t), scale, cells, (H, M, G))
         return H, M, G
 
 

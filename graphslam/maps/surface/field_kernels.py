@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 UNIT = 1024
@@ -29,7 +30,7 @@ MOST = 65535
 """Limit of weights and counts of a piece."""
 
 
-@kernel()
+@callee
 def point_weight(d, along):
     """Weight 0 … `FULL` of a point for a voxel ``d`` in front of its plane and ``along`` in the plane [voxels]."""
     if along >= WIDE or d > FRONT or d <= -BEHIND:
@@ -258,7 +259,7 @@ def make_target(rows, world, figures, target, known):
                 target[r, v, 0], target[r, v, 1] = d, points / (points + 3.0)
 
 
-@kernel()
+@callee
 def fill_block(b, near, phi, known, block, there):
     """The 10³ voxels of a brick with its neighbours: values, and whether they are known."""
     for z in range(10):
@@ -274,7 +275,7 @@ def fill_block(b, near, phi, known, block, there):
                         block[z, y, x] = phi[row, v]
 
 
-@kernel()
+@callee
 def neighbour_values(block, there, z, y, x, step):
     """Values on both sides along an axis, ``step`` its offset; unknown ones are extrapolated linearly."""
     c = block[z, y, x]
@@ -289,7 +290,7 @@ def neighbour_values(block, there, z, y, x, step):
     return a, b
 
 
-@kernel()
+@callee
 def mixed_difference(block, there, z, y, x, first, second):
     """Mixed second difference along two axes; 0 if one of its four corners is unknown."""
     total = 0.0

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphslam.core.geometry import Array
+from graphslam.core.jit import callee
 from graphslam.evidence.kernels import kernel
 
 STEP, SUPPORT, OVERHANG, ABOVE, GROUND, ROUGH = 0, 1, 2, 3, 4, 5
@@ -48,7 +49,7 @@ class DetectorSettings(NamedTuple):
     width: float
 
 
-@kernel()
+@callee
 def put_row(out, key, value, where, lattice):
     """Write a detection, or increase the value of the one of the same line and cell.
 
@@ -81,7 +82,7 @@ def put_row(out, key, value, where, lattice):
     total[0] = count + 1
 
 
-@kernel()
+@callee
 def smooth_heights(s, z, n, reach, out):
     """``out``: mean height of each point and its neighbours on both sides within ``reach``.
 
@@ -98,7 +99,7 @@ def smooth_heights(s, z, n, reach, out):
         out[i] = total / many
 
 
-@kernel()
+@callee
 def follow_ground(s, z, n, foot, f, ground, chain):
     """Classify ground points ``ground (n,)``: 1 continued from the previous ground, 2 on another level; and the state
     before each point, ``chain (n, 4)``.
@@ -178,7 +179,7 @@ def follow_ground(s, z, n, foot, f, ground, chain):
             slope = min(max((last_z - from_z) / (last_s - from_s), -f.most_slope), f.most_slope)
 
 
-@kernel()
+@callee
 def heights_above(s, z, n, ground, reach, out):
     """``out``: height of each point above the nearest ground point of the line; NaN if none is within ``reach``."""
     low = np.empty(n, np.int64)
@@ -198,7 +199,7 @@ def heights_above(s, z, n, ground, reach, out):
         out[i] = height
 
 
-@kernel()
+@callee
 def passed_below(s, z, n, i, edge, ground, f):
     """Whether the beam to point i passed below ground observed by a higher beam of its line, i.e. was a reflection.
 
@@ -211,7 +212,7 @@ def passed_below(s, z, n, i, edge, ground, f):
     return False
 
 
-@kernel()
+@callee
 def observe_line(line, points, origin, foot, lattice, f, out):
     """Detections of one line; ``out``: see `put_row`."""
     m = points.shape[0]
@@ -264,7 +265,7 @@ def observe_line(line, points, origin, foot, lattice, f, out):
     book_steps(line, (p, s, z, height, n), lattice, f, out)
 
 
-@kernel()
+@callee
 def book_steps(line, profile, lattice, f, out):
     """Steps between points of a profile ``(points, ranges, heights, heights above the ground, number)``.
 

@@ -1,5 +1,10 @@
 """Gaussian cells beside plain ones, and the cached nearest neighbour beside a k-d tree."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -195,3 +200,25 @@ def test_thinning_keeps_the_first_of_each_cube_within_ranges():
     np.testing.assert_array_equal(rows, wanted)
     np.testing.assert_array_equal(evenly_spaced_rows(10, 20), np.arange(10))
     assert len(evenly_spaced_rows(1000, 30)) == 30
+
+
+def test_kernels_of_cells_compile_few_functions(tmp_path: Path) -> None:
+    """Slices set to arrays and ``np.linalg`` take more time to compile than all kernels of cells: each compiles
+    functions that format shapes for messages."""
+    code = (
+        "import numpy as np\n"
+        "from numba.core import event\n"
+        "from graphslam_frontends.lidar_odometry.cells import CellMap, LevelConfig\n"
+        "level, points = CellMap(LevelConfig(0.5, 0.05, True)), np.random.default_rng(0).normal(size=(500, 3))\n"
+        "with event.install_recorder('numba:compile') as compiled:\n"
+        "    level.add(points, 0)\n"
+        "    level.keep_since(0)\n"
+        "    level.fit(points, np.eye(3), np.zeros(3), 3.0)\n"
+        "    level.by_slot(points, np.eye(3), np.zeros(3), 3.0, np.ones(1))\n"
+        "print(*{e.data['dispatcher'].py_func.__module__ for _, e in compiled.buffer})\n"
+    )
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert "cell_kernels" in done.stdout, done.stderr
+    assert "numba.cpython.unicode" not in done.stdout
+    assert "numba.np.linalg" not in done.stdout

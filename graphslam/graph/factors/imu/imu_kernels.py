@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
-from graphslam.core.jit import njit
+from graphslam.core.jit import callee, njit
 
 
-@njit
+@callee
 def _turn(w, R, J):
     """``Exp(w)`` and its right Jacobian, both (3, 3), in place."""
     x, y, z = w[0], w[1], w[2]
@@ -34,7 +34,7 @@ def _turn(w, R, J):
             J[i, j] = one - c * O[i, j] + b * o2
 
 
-@njit
+@callee
 def _step(w, a, dt, noise, state):
     """One step over ``dt`` with constant, bias-corrected rate ``w`` and force ``a``; updates the state in place."""
     R, p, v, P, Phi = state
