@@ -6,10 +6,10 @@ carried by colour alone: reference data are dashed or have a marker of their own
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # the colours are also those of the report, which draws without Matplotlib
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -81,6 +81,8 @@ def use_palette() -> None:
     >>> matplotlib.rcParams["axes.prop_cycle"].by_key()["color"][0]
     '#0072B2'
     """
+    import matplotlib.pyplot as plt
+
     plt.rcParams["axes.prop_cycle"] = plt.cycler(color=CYCLE)
 
 
@@ -101,6 +103,8 @@ def line(k: int) -> dict[str, Any]:
 def new_axes(ax: Axes | None, size: tuple[float, float] = FIGURE_SIZE) -> Axes:
     """``ax``, or the axes of a new figure; with the common frame."""
     if ax is None:
+        import matplotlib.pyplot as plt
+
         _, ax = plt.subplots(figsize=size, dpi=DPI, layout="constrained")
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(True, color=PALE, linewidth=0.5, alpha=0.6)

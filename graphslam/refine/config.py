@@ -14,6 +14,9 @@ DISTANCES = (1.0, 0.6, 0.4, 0.3)
 MOST_BEAMS = 3_000_000
 """Largest number of beams from which surfaces are made; more are thinned evenly, which bounds the memory."""
 
+CHECKED_BEAMS = 400_000
+"""Largest number of beams of a check whether scans contradict a path."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineConfig:

@@ -22,7 +22,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.spill_cache import CacheEntry
 from graphslam.graph.sensors.gps import GpsConfig
-from graphslam.refine.config import DISTANCES, MOST_BEAMS, RefineConfig
+from graphslam.refine.config import CHECKED_BEAMS, DISTANCES, MOST_BEAMS, RefineConfig
 from graphslam.refine.fixes import FixModel
 from graphslam.refine.motion import MotionModel, States
 from graphslam.refine.nodes import StepsBetweenNodes, find_nodes, scans_at, thin_beams
@@ -107,13 +107,17 @@ def refine_if_contradicted(
     *,
     progress: Callable[[str], Any] | None = None,
 ) -> Refinement | ScanCheck:
-    """Refine a path only if its scans contradict it; otherwise return the check, in about a third of the time.
+    """Refine a path only if its scans contradict it; otherwise return the check, which needs a part of the beams.
 
     For scans that the odometry of the path has already matched. Parameters as of :func:`refine_by_scans`.
     """
-    work, nodes = _begin(steps, start, config or RefineConfig(), None, progress)
-    check = work.check()
-    return work.run().at_all_steps(steps, start, nodes) if check.contradicted else check
+    check = _begin(steps, start, config or RefineConfig(), None, progress, CHECKED_BEAMS)[0].check()
+    return refine_by_scans(steps, start, config, progress=progress) if check.contradicted else check
+
+
+def odometry_path(steps: Scans, start: Array) -> Array:
+    """Poses of the odometry alone, from the first pose of a path."""
+    return steps.group.compose(start[0], chain_odometry(steps.odometry).poses)
 
 
 def _begin(
@@ -122,8 +126,9 @@ def _begin(
     config: RefineConfig,
     gps: tuple[Gps, GpsConfig] | None,
     progress: Callable[[str], Any] | None,
+    most: int = MOST_BEAMS,
 ) -> tuple[_Refiner, Index]:
-    """A refiner of the steps that are nodes, and the indices of these steps."""
+    """A refiner of the steps that are nodes, with at most ``most`` beams, and the indices of these steps."""
     g = steps.group
     if start.shape != (len(steps), g.size) or not np.all(np.isfinite(start)):
         raise GeometryError(
@@ -134,7 +139,7 @@ def _begin(
     nodes = find_nodes(steps, config.spacing, config.turn)
     if len(nodes) < 3:
         nodes = np.arange(len(steps), dtype=np.int64)
-    some = thin_beams(scans_at(steps, nodes) if len(nodes) < len(steps) else steps, MOST_BEAMS)
+    some = thin_beams(scans_at(steps, nodes) if len(nodes) < len(steps) else steps, most)
     work = _Refiner(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
@@ -228,10 +233,7 @@ class _Refiner:
 
     def check(self) -> ScanCheck:
         """Do the scans contradict the initial path? Only if it has revisits, consecutive chunks are matched, too."""
-        odometry_path = self.odometry_path()
-        pairs = [self.pairs_along(self.start)]
-        if not np.allclose(odometry_path, self.start, rtol=0.0, atol=1e-6):  # equal if the graph changed nothing
-            pairs.append(self.pairs_along(odometry_path))
+        pairs = [self.pairs_along(self.start), self.pairs_along(self.odometry_path())]
         noise = np.min([pair_noise(found, r) for found, r in pairs], axis=0)
         shares = [agreeing_share(found, r, noise) for found, r in pairs]
         check = ScanCheck(shares[-1], shares[0], np.zeros((0, 2), np.int64))
@@ -242,7 +244,7 @@ class _Refiner:
 
     def odometry_path(self) -> Array:
         """Poses of the odometry alone, from the first pose of the initial path."""
-        return self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
+        return odometry_path(self.steps, self.start)
 
     def initial_result(self, found: Refinement, odometry: Array) -> Refinement:
         """The path of the odometry, with the covariance of motion and gravity, without scans."""

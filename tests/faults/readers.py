@@ -225,7 +225,7 @@ def finished_run() -> Path:
     import tempfile
 
     from graphslam.app.report import report
-    from graphslam.app.run import outputs
+    from graphslam.app.run import figures
     from graphslam.app.run.pipeline import run
     from graphslam.app.worlds import simulate
 
@@ -235,7 +235,7 @@ def finished_run() -> Path:
     import pytest
 
     with pytest.MonkeyPatch.context() as patch:  # pictures take longer than the run
-        patch.setattr(outputs, "save_figures", lambda *_: None)
+        patch.setattr(figures, "save_figures", lambda *_: None)
         patch.setattr(report, "add_report", lambda *_: None)
         run(log, frontend="rbpf-ekf", out=out, progress=False, config={"frontend": {"particles": 5}})
     arrays = {"times": gps.times, "positions": gps.positions, "sigma": gps.sigma, "lever": gps.lever}

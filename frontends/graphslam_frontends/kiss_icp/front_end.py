@@ -40,7 +40,6 @@ from graphslam_frontends.lidar_odometry.odometry import (
     SCALE,
     STILL,
     SUSPICIOUS,
-    Index,
     LidarOdometry,
     RawScan,
     ScanResult,
@@ -130,18 +129,17 @@ class KissIcpOdometry(LidarOdometry):
     def _match(
         self,
         raw: RawScan,
-        chosen: Index,
         predicted: Array,
         bridge: Array | None,
         spread: Array | None,
         time: float,
         by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
-        points, self.off = self._unbent(raw, predicted, time)[chosen], np.zeros(6)
+        points, self.off = self._unbent(raw, predicted, time), np.zeros(6)
         if len(points) < FEW:
             return predicted, None, ScanResult(len(points), 0.0, 6, "empty", False)
         pose = self._register(self._unbent(RawScan(*self._whole), predicted, time))
-        points = self._unbent(raw, pose, time)[chosen]
+        points = self._unbent(raw, pose, time)
         fit = self.levels[-1].fit(points, *split_pose(pose), SCALE)
         state = "matched"
         if len(self.overlaps) >= 3 and fit.overlap < SUSPICIOUS * np.median(self.overlaps):

@@ -17,6 +17,7 @@ from graphslam.core.jit import callee, njit
 F8 = npt.NDArray[np.float64]
 I8 = npt.NDArray[np.int64]
 I4 = npt.NDArray[np.int32]
+I1 = npt.NDArray[np.int8]
 
 FINE = 4
 """Cached cubes along the edge of a cell."""
@@ -61,8 +62,8 @@ class Cells(NamedTuple):
     """Valid cells among the 27 neighbours ``(b, 27)``."""
     n_around: I4
     """Number of these; -1: not looked up."""
-    near: I4
-    """Nearest cell of each cached cube ``(b, 64)``."""
+    near: I1
+    """Nearest cell of each cached cube ``(b, 64)``, as an index into ``around``."""
     used: I8
     """Number of blocks in use ``(1,)``."""
 
@@ -125,8 +126,11 @@ def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
                 at = _find(c, cube)
                 if at < 0 or c.n_around[at] < 0:
                     continue
+                own = 0
+                while own < c.n_around[at] and c.around[at, own] != b:
+                    own += 1
                 if new:
-                    c.around[at, c.n_around[at]] = b
+                    c.around[at, own] = b
                     c.n_around[at] += 1
                 x0 = (((cube >> 42) & _MASK) - _HALF) * size + 0.5 * fine
                 y0 = (((cube >> 21) & _MASK) - _HALF) * size + 0.5 * fine
@@ -136,16 +140,16 @@ def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
                     for j in range(FINE):
                         for k in range(FINE):
                             known = c.near[at, sub]
-                            if known == b:
+                            if known == own:
                                 c.near[at, sub] = UNKNOWN
                             elif known == NONE:
-                                c.near[at, sub] = b
+                                c.near[at, sub] = own
                             elif known >= 0:
                                 u, v, w = x0 + i * fine, y0 + j * fine, z0 + k * fine
                                 d = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
-                                n = c.centre[known]
+                                n = c.centre[c.around[at, known]]
                                 if d < (n[0] - u) ** 2 + (n[1] - v) ** 2 + (n[2] - w) ** 2:
-                                    c.near[at, sub] = b
+                                    c.near[at, sub] = own
                             sub += 1
 
 
@@ -334,13 +338,12 @@ def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
     x = (((key >> 42) & _MASK) - _HALF) * size + (sub // (FINE * FINE) + 0.5) * fine
     y = (((key >> 21) & _MASK) - _HALF) * size + ((sub // FINE) % FINE + 0.5) * fine
     z = ((key & _MASK) - _HALF) * size + (sub % FINE + 0.5) * fine
-    best, nearest = np.int64(NONE), np.inf
+    best, nearest, c.near[b, sub] = np.int64(NONE), np.inf, NONE
     for k in range(c.n_around[b]):
         at = c.around[b, k]
         d = (c.centre[at, 0] - x) ** 2 + (c.centre[at, 1] - y) ** 2 + (c.centre[at, 2] - z) ** 2
         if d < nearest:
-            nearest, best = d, np.int64(at)
-    c.near[b, sub] = best
+            nearest, best, c.near[b, sub] = d, np.int64(at), k
     return best
 
 
@@ -359,10 +362,10 @@ def _nearest(c: Cells, x: float, y: float, z: float, size: float) -> Any:
     j = np.int64(np.floor(y * fine)) & (FINE - 1)
     k = np.int64(np.floor(z * fine)) & (FINE - 1)
     sub = (i * FINE + j) * FINE + k
-    at = np.int64(c.near[b, sub])
+    at = c.near[b, sub]
     if at == UNKNOWN:
-        at = _fill(c, b, key, sub, size)
-    return at
+        return _fill(c, b, key, sub, size)
+    return np.int64(c.around[b, at]) if at >= 0 else np.int64(NONE)
 
 
 @njit(nogil=True)
@@ -374,20 +377,22 @@ def nearest_cells(c: Cells, points: F8, size: float, out: I8) -> None:
 
 @njit(nogil=True)
 def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: float, out: F8) -> None:
-    """Mean of ``exp(-d² / 2σ²)`` over points, for each rotation ``(m, 3, 3)`` about a position ``t``."""
+    """Add to ``out`` the sum of ``exp(-d² / 2σ²)`` over points, for each rotation ``(m, 3, 3)`` about a position ``t``.
+
+    Point by point: successive rotations move one point into cubes that are near each other, also in memory.
+    """
     k = -0.5 / (sigma * sigma)
-    for r in range(len(R)):
-        total = 0.0
-        M = R[r]
-        for p in range(len(points)):
-            x = M[0, 0] * points[p, 0] + M[0, 1] * points[p, 1] + M[0, 2] * points[p, 2] + t[0]
-            y = M[1, 0] * points[p, 0] + M[1, 1] * points[p, 1] + M[1, 2] * points[p, 2] + t[1]
-            z = M[2, 0] * points[p, 0] + M[2, 1] * points[p, 1] + M[2, 2] * points[p, 2] + t[2]
+    for p in range(len(points)):
+        a, b, e = points[p, 0], points[p, 1], points[p, 2]
+        for r in range(len(R)):
+            M = R[r]
+            x = M[0, 0] * a + M[0, 1] * b + M[0, 2] * e + t[0]
+            y = M[1, 0] * a + M[1, 1] * b + M[1, 2] * e + t[1]
+            z = M[2, 0] * a + M[2, 1] * b + M[2, 2] * e + t[2]
             at = _nearest(c, x, y, z, size)
             if at >= 0:
                 d = (c.centre[at, 0] - x) ** 2 + (c.centre[at, 1] - y) ** 2 + (c.centre[at, 2] - z) ** 2
-                total += np.exp(k * d)
-        out[r] = total / max(len(points), 1)
+                out[r] += np.exp(k * d)
 
 
 @callee
@@ -605,6 +610,36 @@ def descend_pose(
         if turned < stop[0] and np.sqrt(d[3] ** 2 + d[4] ** 2 + d[5] ** 2) < stop[1]:
             return step + 1
     return stop[2]
+
+
+@njit(nogil=True)
+def deskew_points(points: F8, ages: F8, twist: F8, dt: float, most: float, out: F8) -> None:
+    """Points in the frame of the body at the stamp, for a uniform motion ``Exp(twist)`` in the ``dt`` [s] before it.
+
+    Ages [s] are limited to ``most`` multiples of ``dt``.
+    """
+    w, v = twist[:3], twist[3:]
+    turn = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    across = np.array([w[1] * v[2] - w[2] * v[1], w[2] * v[0] - w[0] * v[2], w[0] * v[1] - w[1] * v[0]])
+    along = w[0] * v[0] + w[1] * v[1] + w[2] * v[2]
+    for p in range(len(points)):
+        s = -min(max(ages[p] / dt, -most), most)
+        x = s * turn
+        # Exp(s twist): sine, 1 - cosine and x - sine, divided by powers of the rate
+        if abs(x) < 1e-3:
+            a, b = s * (1.0 - x * x / 6.0), s * s * (0.5 - x * x / 24.0)
+            d = s * s * s * (1.0 / 6.0 - x * x / 120.0)
+        else:
+            sine, half = np.sin(x), np.sin(0.5 * x)
+            a, b, d = sine / turn, 2.0 * half * half / (turn * turn), (x - sine) / (turn * turn * turn)
+        i, j, k = points[p]
+        dot = w[0] * i + w[1] * j + w[2] * k
+        for q in range(3):
+            m, n = (q + 1) % 3, (q + 2) % 3
+            cross = w[m] * points[p, n] - w[n] * points[p, m]
+            # w × (w × p) = w (w · p) - p w²
+            turned = points[p, q] + a * cross + b * (w[q] * dot - points[p, q] * turn * turn)
+            out[p, q] = turned + s * v[q] + b * across[q] + d * (w[q] * along - v[q] * turn * turn)
 
 
 @njit(nogil=True)

@@ -122,13 +122,11 @@ class CellMap:
 
     def scores(self, points: Array, R: Array, t: Array) -> Array:
         """Scores, 0 to 1, of points ``(n, 3)`` at rotations ``(m, 3, 3)`` about a position ``t``."""
-        self.room(len(points) * 8)
-        out, step = np.empty(len(R)), max(1, 8)
-        sigma = 0.4 * self.config.size
-        for k in range(0, len(R), step):
-            self.room(len(points) * step)
-            kernels.score_rotations(self.cells, points, R[k : k + step], t, self.config.size, sigma, out[k : k + step])
-        return out
+        out, sigma = np.zeros(len(R)), 0.4 * self.config.size
+        for k in range(0, len(points), 8):
+            self.room(8 * len(R))
+            kernels.score_rotations(self.cells, points[k : k + 8], R, t, self.config.size, sigma, out)
+        return out / max(len(points), 1)
 
     def fit(self, points: Array, R: Array, t: Array, scale: float) -> NormalEquations:
         """Normal equations of points ``(n, 3)``, body frame, at a pose."""
@@ -201,7 +199,7 @@ def _empty(blocks: int, rows: int) -> kernels.Cells:
         made=np.zeros(blocks),
         around=np.zeros((blocks, 27), np.int32),
         n_around=np.full(blocks, -1, np.int32),
-        near=np.full((blocks, 64), kernels.UNKNOWN, np.int32),
+        near=np.full((blocks, 64), kernels.UNKNOWN, np.int8),
         used=np.zeros(1, np.int64),
     )
 

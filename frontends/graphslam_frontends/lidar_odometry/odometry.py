@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array
+from graphslam_frontends.lidar_odometry.cell_kernels import deskew_points
 from graphslam_frontends.lidar_odometry.cells import (
     CellMap,
     LevelConfig,
@@ -47,6 +48,8 @@ COARSE = np.diag([1.0 / 0.05**2] * 3 + [1.0 / 0.2**2] * 3)
 """Information matrix of the result of the coarse levels, as a prior on the finest one (0.05 rad, 0.2 m)."""
 SEARCHED = 300
 """Points used in a search over rotations."""
+FINALISTS = 64
+"""Rotations of a search that are compared with all of these points."""
 SEARCH_STEP, SEARCH_SIDE = np.deg2rad(4.0), 3
 """Near search: ±3 steps of 4° about each axis."""
 WIDE_STEP, WIDE_SIDE = np.deg2rad(8.0), 8
@@ -187,10 +190,15 @@ class RawScan:
         """Points in the body frame at the stamp ``(n, 3)``; ``motion`` (7,) is uniform in the ``dt`` [s] before it."""
         if self.ages is None or dt <= 0:
             return self.points
+        out = np.empty(self.points.shape)
         # ages in a wrong unit must not give unbounded points
-        ages = np.clip(self.ages / dt, -LONG_SWEEP, LONG_SWEEP)
-        steps = -ages[:, None] * np.asarray(se3.se3_log(motion))
-        return np.asarray(se3.se3_transform(se3.se3_exp(steps), self.points))
+        deskew_points(self.points, self.ages, np.asarray(se3.se3_log(motion)), dt, LONG_SWEEP, out)
+        return out
+
+    def some(self, rows: Index) -> RawScan:
+        """Rows of the points."""
+        parts = (None if a is None else a[rows] for a in (self.ages, self.straight))
+        return RawScan(self.points[rows], *parts)
 
 
 class LidarOdometry:
@@ -293,15 +301,14 @@ class LidarOdometry:
         dt = time - self.time if np.isfinite(self.time) else 0.0
         self._since(raw, time)
         chosen = evenly_spaced_rows(len(kept), c.most_points)
-        points = self._unbent(raw, predicted, time)[chosen]
         if self.scan == self.first:
-            seen = ScanResult(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
-            self.first += len(points) < FEW
+            seen = ScanResult(len(chosen), np.nan, 0, "first" if len(chosen) >= FEW else "empty", False)
+            self.first += len(chosen) < FEW
             fit = None
             if bridge is not None:
                 self.pose, seen = bridge, replace(seen, bridged=True)
         else:
-            self.pose, fit, seen = self._match(raw, chosen, predicted, bridge, Q, time, ahead is not None)
+            self.pose, fit, seen = self._match(raw.some(chosen), predicted, bridge, Q, time, ahead is not None)
             seen = replace(seen, watched=bridge is not None, bridged=bridge is not None and seen.unobservable > 0)
         if ahead is not None or raw.straight is not None:
             seen = replace(seen, aided=True)
@@ -459,7 +466,6 @@ class LidarOdometry:
     def _match(
         self,
         raw: RawScan,
-        chosen: Index,
         predicted: Array,
         bridge: Array | None,
         reckoned: Array | None,
@@ -470,7 +476,6 @@ class LidarOdometry:
 
         Parameters
         ----------
-        chosen : (k,) int
         predicted : (7,)
             Initial guess of the match.
         bridge : (7,) or None
@@ -489,7 +494,7 @@ class LidarOdometry:
             off = np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
             return inertial is None or bool(np.linalg.norm(off[:3]) < GYRO_OFF and np.linalg.norm(off[3:]) < reach)
 
-        points = self._unbent(raw, predicted, time)[chosen]
+        points = self._unbent(raw, predicted, time)
         stands = predicted if bridge is None else bridge
         if len(points) < FEW:
             return stands, None, ScanResult(len(points), 0.0, 6, "empty", False)
@@ -504,11 +509,11 @@ class LidarOdometry:
             near = [x for x in tried if alike(x[1])]
             start = max(near, key=lambda x: x[0])[1] if near else predicted
         start = start if alike(start) else predicted
-        pose, points, fit = self._finish(raw, chosen, start, time)
+        pose, points, fit = self._finish(raw, start, time)
         led = float(np.linalg.norm(se3.se3_between(predicted, start)[:3]))
         if self.held >= BEGUN and led > LED_AWAY * self.config.levels[-1]:
             # the coarse levels left the prediction's range of convergence: compare both on the finest level
-            ahead = self._finish(raw, chosen, predicted, time)
+            ahead = self._finish(raw, predicted, time)
             if ahead[2].overlap > fit.overlap:
                 start, (pose, points, fit) = predicted, ahead
         state = "matched"
@@ -520,7 +525,7 @@ class LidarOdometry:
             overlap, best = max(near, key=lambda x: x[0]) if near else (0.0, start)
             if overlap > BETTER * fit.overlap:
                 start = best
-                pose, points, fit = self._finish(raw, chosen, start, time)
+                pose, points, fit = self._finish(raw, start, time)
                 state = "found again"
             if few_of_it and fit.overlap < SUSPICIOUS * np.median(self.overlaps):
                 # after lost scans, little overlap means a misplaced scan, not new space
@@ -533,7 +538,7 @@ class LidarOdometry:
             while not alike(pose) and alike(pose, np.inf) and unobservable < MOST_WEAK:
                 # weak directions let a scan slide, for example along a wall: use the IMU along them
                 pose, unobservable = self._hold(free, stands, fit, unobservable + 1)
-                at_it = self.levels[-1].fit(self._unbent(raw, pose, time)[chosen], *split_pose(pose), SCALE)
+                at_it = self.levels[-1].fit(self._unbent(raw, pose, time), *split_pose(pose), SCALE)
                 state = "matched" if at_it.overlap > SUSPICIOUS * fit.overlap else "lost"
         if state == "lost" or not alike(pose):
             return stands, None, ScanResult(len(points), fit.overlap, 6, "lost", searched)
@@ -541,7 +546,7 @@ class LidarOdometry:
             return start if bridge is None else bridge, None, ScanResult(len(points), fit.overlap, 6, state, searched)
         if unobservable and bridge is None and len(self.missed) < 3:
             # the motion model is still unknown: zero velocity is used only if the scan fits there as well
-            points = self._unbent(raw, pose, time)[chosen]
+            points = self._unbent(raw, pose, time)
             if self.levels[-1].fit(points, *split_pose(pose), SCALE).overlap < LIKELY * fit.overlap:
                 pose = free
         if state != "new space":
@@ -552,12 +557,14 @@ class LidarOdometry:
             )
         return pose, fit, ScanResult(len(points), fit.overlap, unobservable, state, searched)
 
-    def _finish(self, raw: RawScan, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, NormalEquations]:
+    def _finish(self, raw: RawScan, pose: Array, time: float) -> tuple[Array, Array, NormalEquations]:
         """Match on the finest level: pose, points deskewed with it, fit."""
+        prior = None
         for _ in range(MOST_DESKEWED):
-            points = self._unbent(raw, pose, time)[chosen]
+            points = self._unbent(raw, pose, time)
             before = pose
-            pose, fit = self._descend(points, pose, self.levels[-1:])
+            prior = COARSE + self._coarser(points, *split_pose(pose))
+            pose, fit = self._descend(points, pose, self.levels[-1:], prior)
             moved = se3.se3_log(se3.se3_between(before, pose))
             # deskewing with a wrong motion shifts each pose a little, always to the same side: repeat until convergence
             stood = np.linalg.norm(moved[:3]) < STILL[0] and np.linalg.norm(moved[3:]) < STILL[1]
@@ -576,13 +583,18 @@ class LidarOdometry:
         off = se3.se3_log(se3.se3_between(predicted, start))
         return bool(np.linalg.norm(off[:3]) < NEAR[0] and np.linalg.norm(off[3:]) < NEAR[1])
 
-    def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, NormalEquations]:
-        """Gauss–Newton on one level after the other; on coarse ones the start is kept along unobservable directions."""
+    def _descend(
+        self, points: Array, pose: Array, levels: list[CellMap], prior: Array | None = None
+    ) -> tuple[Array, NormalEquations]:
+        """Gauss–Newton on one level after the other; on coarse ones the start is kept along unobservable directions.
+
+        ``prior`` is the information of the coarse levels, ``(6, 6)``, for the finest one.
+        """
         fit = None
         for level in levels:
             R, t = split_pose(pose.copy())
             if level is self.levels[-1]:
-                prior = COARSE + self._coarser(points, R, t)
+                prior = COARSE + self._coarser(points, R, t) if prior is None else prior
                 fit = level.descend(points, R, t, SCALE, prior, STILL, MOST_STEPS)
                 pose = np.concatenate([t, se3.matrix_to_quat(R)])
                 continue
@@ -610,6 +622,8 @@ class LidarOdometry:
         for centre in centres:
             R, t = split_pose(centre)
             tries = R @ rotations
+            # every fourth point shows which rotations deserve all of them
+            tries = tries[np.argsort(-self.levels[0].scores(few[::4], tries, t), kind="stable")[:FINALISTS]]
             scores = self.levels[0].scores(few, tries, t)
             for k in np.argsort(-scores, kind="stable")[:best]:
                 start = np.concatenate([t, se3.matrix_to_quat(tries[k])])
@@ -619,6 +633,8 @@ class LidarOdometry:
 
     def _hold(self, pose: Array, predicted: Array, fit: NormalEquations, least: int = 0) -> tuple[Array, int]:
         """Use the prediction along unobservable directions, at least ``least`` of them; and their number."""
+        if not least and all_observable(fit.H, fit.every):
+            return pose, 0
         P = observable_projection(fit.H, fit.every, least)
         unobservable = 6 - round(float(np.trace(P)))
         if unobservable:
@@ -632,6 +648,16 @@ def _far(predicted: Array, pose: Array, spread: Array) -> bool:
     off = se3.se3_log(se3.se3_between(predicted, pose))
     turn, shift = (FAR * np.sqrt(np.trace(block)) for block in (spread[:3, :3], spread[3:, 3:]))
     return bool(np.linalg.norm(off[:3]) > NEAR[0] + turn or np.linalg.norm(off[3:]) > NEAR[1] + shift)
+
+
+def all_observable(H: Array, every: Array) -> bool:
+    """Are all directions observable? Much faster than :func:`observable_projection`, whose rank would be six."""
+    _, B = _spurious(H, every)
+    try:
+        np.linalg.cholesky(H - NOISE_INDUCED * B)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def observable_projection(H: Array, every: Array, least: int = 0) -> Array:
@@ -663,9 +689,14 @@ def observable_gradient(H: Array, every: Array, least: int = 0) -> Array:
 
 
 def _directions(H: Array, every: Array) -> tuple[Array, Array, Array]:
-    every = 1.01 * every + np.eye(6)
-    B = NORMAL_SIGMA**2 * (every - H) + 1e-9 * every
+    every, B = _spurious(H, every)
     return *direction_strengths(H, every, NORMAL_SIGMA), B
+
+
+def _spurious(H: Array, every: Array) -> tuple[Array, Array]:
+    """Regularised ``every``, and the spurious information caused by noise of the normals."""
+    every = 1.01 * every + np.eye(6)
+    return every, NORMAL_SIGMA**2 * (every - H) + 1e-9 * every
 
 
 def split_pose(pose: Array) -> tuple[Array, Array]:

@@ -16,7 +16,6 @@ import pandas as pd
 from graphslam.app.folders.generations import FolderTransaction, new_generation, read_consistently
 from graphslam.app.folders.output_files import json_lines
 from graphslam.app.report.report import add_report
-from graphslam.app.run.figures import save_figures
 from graphslam.app.run.files import (
     ASSOCIATION_FORMAT,
     FIXES_FORMAT,
@@ -187,6 +186,8 @@ def _write_tables(new: FolderTransaction, run: Run) -> None:
 
 
 def _write_figures(new: FolderTransaction, run: Run) -> None:
+    from graphslam.app.run.figures import save_figures  # Matplotlib: not loaded by runs without a folder
+
     save_figures(run, new.figures)
 
 

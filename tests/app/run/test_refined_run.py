@@ -19,7 +19,7 @@ from graphslam.app.export import export
 from graphslam.app.folders.generations import current_outputs
 from graphslam.app.hypotheses import minimum_entropy_loops, write_minimum_entropy
 from graphslam.app.report.report import make_report
-from graphslam.app.run import outputs, stages, submap_slam
+from graphslam.app.run import figures, outputs, stages, submap_slam
 from graphslam.app.run.outputs import SAME_BYTES, read_run_folder, refined_submaps_of
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.remake_map import map_of_folder
@@ -68,7 +68,7 @@ def copy(finished: Run, tmp_path: Path) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures take as long as the rest."""
-    monkeypatch.setattr(outputs, "save_figures", lambda *_: [])
+    monkeypatch.setattr(figures, "save_figures", lambda *_: [])
     monkeypatch.setattr(outputs, "draw_run_map", lambda *_, **__: [])
 
 

@@ -136,7 +136,7 @@ def rko_lio(folder: Path) -> Measured:
         return begin + np.round(1e9 * t).astype(np.int64)
 
     def call() -> dict[str, Any]:
-        lio, done, poses = LIO(LIOConfig(max_num_threads=1, initialization_phase=True)), 0, []
+        lio, done, poses = LIO(LIOConfig(max_num_threads=1)), 0, []
         at = stamps(imu["times"])
         for k in range(len(scans)):
             some = slice(scans.offsets[k], scans.offsets[k + 1])
