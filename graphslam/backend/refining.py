@@ -24,7 +24,7 @@ from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import odometry_path, refine_by_scans, refine_if_contradicted
+from graphslam.refine.refine import refine_by_scans, refine_if_contradicted
 from graphslam.refine.result import Refinement, ScanCheck
 from graphslam.refine.revisit_constraints import FAR, tangent_lengths
 from graphslam.refine.scans import Scans
@@ -108,12 +108,6 @@ def refine_run(
     try:
         start = path.interpolate(np.clip(scans.times, path.times[0], path.times[-1]))
         if config.use != "always" and gps is None and scans.matched:
-            if np.allclose(odometry_path(scans, start), start, rtol=0.0, atol=1e-6):
-                text = (
-                    "refinement: not used — the graph did not change the path of the odometry, which has matched the "
-                    "same scans."
-                )
-                return None, [Finding("", "refine-nothing-new", text)]
             found = refine_if_contradicted(scans, start, config, progress=progress)
         else:
             found = refine_by_scans(scans, start, config, gps=gps, progress=progress)
