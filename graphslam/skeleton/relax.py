@@ -94,6 +94,12 @@ class RelaxConfig:
         if self.iterations < 1 or self.inner < 1 or self.threads < 1 or self.gain < 0 or self.move < 0:
             raise ConfigError("iterations, inner and threads of a relaxation are at least 1, gain and move at least 0")
 
+    @classmethod
+    def paper(cls) -> RelaxConfig:
+        """As in urban GraphSLAM: conjugate gradients from the odometry, no preconditioner, no outlier detection."""
+        levels = PreconditionerLevels(-1, 0)
+        return cls(method="cg", start="odometry", iterations=300, levels=levels, rebuild=0, split=False)
+
 
 @dataclass(frozen=True)
 class Iteration:
