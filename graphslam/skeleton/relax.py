@@ -97,8 +97,7 @@ class RelaxConfig:
     @classmethod
     def paper(cls) -> RelaxConfig:
         """As in urban GraphSLAM: conjugate gradients from the odometry, no preconditioner, no outlier detection."""
-        levels = PreconditionerLevels(-1, 0)
-        return cls(method="cg", start="odometry", iterations=300, levels=levels, rebuild=0, split=False)
+        return cls("cg", "odometry", 300, levels=PreconditionerLevels(-1, 0), rebuild=0, split=False)
 
 
 @dataclass(frozen=True)
@@ -479,13 +478,9 @@ def conjugate_gradients(
     predicted : float
         ``xᵀ b``: decrease of the objective in the linear model.
     """
-    x = np.zeros_like(b)
-    r = b.copy()
-    z = M(r)
-    d = z.copy()
-    now = first = _dot(r, z)
-    predicted = 0.0
-    gains: list[float] = []
+    x, r, gains = np.zeros_like(b), b.copy(), list[float]()
+    d = M(r).copy()
+    now = first = _dot(r, d)
     while len(gains) < most and now > 0.0:
         q = product(d)
         curve = _dot(d, q)
@@ -494,7 +489,6 @@ def conjugate_gradients(
         a = now / curve
         x += a * d
         r -= a * q
-        predicted += a * now
         gains.append(a * now)
         z = M(r)
         new = _dot(r, z)
@@ -503,4 +497,4 @@ def conjugate_gradients(
         d *= new / now
         d += z
         now = new
-    return x, predicted, len(gains)
+    return x, sum(gains), len(gains)
