@@ -164,7 +164,7 @@ def test_uneven_fixes_and_pseudoranges_are_stored(tmp_path):
 def test_covariances_of_fixes_are_checked():
     common = {"times": [0.0, 1.0], "positions": np.zeros((2, 3)), "sigma": np.ones(2), "lever": np.zeros(3)}
     for bad in (np.diag([1.0, 1.0, -1.0]), np.diag([1.0, 1.0, 0.0]), np.eye(3) + np.eye(3, k=1)):
-        with pytest.raises(DataError, match="covariance of record 1"):
+        with pytest.raises(DataError, match="covariance of GPS record 1"):
             Gps(**common, covariances=np.stack([np.eye(3), bad]))
     even = Gps.upright(
         times=np.arange(2.0), positions=np.zeros((2, 3)), horizontal=1.0, vertical=3.0, lever=np.zeros(3)

@@ -96,7 +96,7 @@ def test_scans_that_the_odometry_matched_are_refined_only_if_forced(log, tmp_pat
     assert run.refined is None
     line = next(f for f in run.verdict if f.code == "refine-nothing-new")
     assert line.level == ""
-    assert "did not change the path of the odometry" in line.text
+    assert "Scan agreement: odometry" in line.text
     assert "has matched the same scans" in make_report(run.folder).html
     assert not (run.folder / "trajectory_graph.tum").exists()
     assert (run.folder / "map.ply").exists()
