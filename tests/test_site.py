@@ -76,6 +76,14 @@ def test_a_change_of_notebook_or_code_or_data_makes_other_outputs(book: Path, mo
     assert len(names) == 4
 
 
+def test_formulas_of_notebooks_are_on_lines_of_their_own() -> None:
+    """Others are not typeset."""
+    for book in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(book.read_text())["cells"]
+        text = "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+        assert all(line == "$$" for line in text.split("\n") if "$$" in line), book.name
+
+
 def test_formulas_are_typeset_without_a_script() -> None:
     found = site_pages.FORMULA.sub(lambda m: site_pages.typeset(m[1]), "Text\n\n$$\nx^2\n$$\n\nmore, 5 $ and $$.\n")
     assert re.search(r'<div class="formula"><math .*<msup><mi>x</mi><mn>2</mn></msup>.*</math></div>', found)
