@@ -62,7 +62,8 @@ class Pseudoranges(RaggedStream):
         self._check_offsets(q)
         shapes = {"satellites": (q, 3), "lever": (3,)}
         for name in ("ranges", "satellites", "elevation", "density", "lever"):
-            object.__setattr__(self, name, finite(array_of(getattr(self, name), shapes.get(name, (q,)), name), name))
+            a = array_of(getattr(self, name), shapes.get(name, (q,)), name)
+            object.__setattr__(self, name, finite(a, name, "pseudorange"))
         object.__setattr__(self, "sigmas", positive(self.sigmas, q, "pseudorange", "m"))
         for name in ("ids", "systems"):
             w = np.ascontiguousarray(getattr(self, name), dtype=np.int64)

@@ -161,7 +161,7 @@ def unwritable() -> str:
 def _warn_not_kept(why: str) -> None:
     if multiprocessing.parent_process() is None:
         logger.warning(
-            "compiled code cannot be kept in %s (%s): kernels are compiled again at every start, about 25 s; "
+            "compiled code cannot be kept in %s (%s): kernels are compiled again at every start, up to a minute; "
             "make the folder writable or set NUMBA_CACHE_DIR to one that is",
             compiled_folder(),
             why,

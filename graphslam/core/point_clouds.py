@@ -16,7 +16,7 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
-from graphslam.core.records import RowStream, check_times
+from graphslam.core.records import RowStream, check_offsets, check_times
 
 
 class CloudSource(Protocol):
@@ -92,24 +92,6 @@ class ArrayClouds:
     def packed(self) -> bytes:
         """See :class:`CloudSource`."""
         return self.points.tobytes() + (b"" if self.before is None else self.before.tobytes())
-
-
-def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:
-    """Validate ``(n + 1,)`` offsets that partition ``total`` rows: from 0, not decreasing, to ``total``."""
-    a = np.asarray(offsets)
-    if a.ndim != 1 or len(a) < 1 or a.dtype.kind not in "iu":
-        raise DataError(
-            "offsets have the wrong shape or type", where=where, got=f"{a.dtype} {a.shape}", wanted="(n+1,)"
-        )
-    a = np.ascontiguousarray(a, dtype=np.int64)
-    if a[0] != 0 or np.any(np.diff(a) < 0):
-        k = 0 if a[0] != 0 else int(np.flatnonzero(np.diff(a) < 0)[0]) + 1
-        raise DataError(
-            f"offset {k} is impossible", where=where, got=int(a[k]), wanted="offsets that begin with 0 and never fall"
-        )
-    if a[-1] != total:
-        raise DataError("offsets do not match the points", where=where, got=int(a[-1]), wanted=f"{total}, the last one")
-    return a
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-COMPILING = "compiling (first run only, about 25 s for a lidar log)"
+COMPILING = "compiling (first run only, up to a minute)"
 """Text of a bar while kernels are compiled."""
 
 

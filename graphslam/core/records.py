@@ -59,10 +59,11 @@ class RaggedStream:
 
     def _check_offsets(self, rows: int) -> None:
         object.__setattr__(self, "times", check_times(self.times))
-        o, n = np.ascontiguousarray(self.offsets, dtype=np.int64), len(self.times)
-        if len(o) != n + 1 or o[0] != 0 or o[-1] != rows or np.any(np.diff(o) < 0):
-            raise DataError("offsets do not partition the observations", got=o.shape, wanted=f"({n + 1},)")
-        object.__setattr__(self, "offsets", o)
+        n = len(self.times)
+        if len(self.offsets) != n + 1:
+            raise DataError("offsets do not partition the observations", got=len(self.offsets), wanted=n + 1)
+        offsets = np.ascontiguousarray(self.offsets, dtype=np.int64)
+        object.__setattr__(self, "offsets", check_offsets(offsets, rows))
 
     def scan(self, k: int) -> slice:
         """Rows of scan k."""
@@ -116,6 +117,29 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
     return t
 
 
+def check_offsets(offsets: Any, total: int, *, where: str | None = None) -> npt.NDArray[np.int64]:
+    """Validate ``(n + 1,)`` offsets that partition ``total`` rows: from 0, not decreasing, to ``total``."""
+    a = np.asarray(offsets)
+    if a.ndim != 1 or len(a) < 1 or a.dtype.kind not in "iu":
+        raise DataError(
+            "offsets have the wrong shape or type", where=where, got=f"{a.dtype} {a.shape}", wanted="(n+1,)"
+        )
+    a = np.ascontiguousarray(a, dtype=np.int64)
+    if a[0] != 0 or np.any(np.diff(a) < 0):
+        k = 0 if a[0] != 0 else int(np.flatnonzero(np.diff(a) < 0)[0]) + 1
+        raise DataError(
+            f"offset {k} is impossible", where=where, got=int(a[k]), wanted="offsets that begin with 0 and never fall"
+        )
+    if a[-1] != total:
+        raise DataError(
+            "offsets do not match the points",
+            where=where,
+            got=int(a[-1]),
+            wanted=f"{total}, the last one of a partition",
+        )
+    return a
+
+
 def array_of(x: Any, shape: tuple[int, ...], name: str) -> Array:
     """A float array of a shape; -1: any length."""
     a = np.ascontiguousarray(x, dtype=np.float64)
@@ -124,11 +148,11 @@ def array_of(x: Any, shape: tuple[int, ...], name: str) -> Array:
     return a
 
 
-def finite(a: Array, name: str) -> Array:
+def finite(a: Array, name: str, what: str = "record") -> Array:
     """The array, if it is finite."""
     if not np.all(finite_mask(a)):
         k = int(np.argwhere(~finite_mask(a))[0][0])
-        raise DataError(f"{name} of record {k} is not finite", got=a[k], wanted="finite numbers")
+        raise DataError(f"{name} of {what} {k} is not finite", got=a[k], wanted="finite numbers")
     return a
 
 

@@ -13,9 +13,8 @@ from graphslam.core.atomic import read_npz, write_npz
 from graphslam.core.errors import DataError, FormatError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.npz import Field, flags, floats, ints
-from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
-from graphslam.core.records import Odometry, check_times
+from graphslam.core.records import Odometry, check_offsets, check_times
 from graphslam_frontends.odometry.motion_prior import BiasSigmas
 from graphslam_frontends.odometry.steps import Steps
 

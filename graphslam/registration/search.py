@@ -158,10 +158,10 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
     -------
     (headings, z, y, x) uint32
     """
-    return last_value(_scoring(points, field, around, lattice))
+    return last_value(_score_in_slices(points, field, around, lattice))
 
 
-def _scoring(
+def _score_in_slices(
     points: Array, field: SearchField, around: Array, lattice: SearchLattice
 ) -> Generator[None, None, npt.NDArray[np.uint32]]:
     """:func:`score_lattice` in slices of some headings."""
@@ -247,10 +247,10 @@ def correlative_search(
     -----
     Deterministic.
     """
-    return last_value(searching(source, field, around, half_widths, steps, keep, coarse=coarse, config=config))
+    return last_value(search_in_slices(source, field, around, half_widths, steps, keep, coarse=coarse, config=config))
 
 
-def searching(
+def search_in_slices(
     source: Any,
     field: SearchField,
     around: Any,
@@ -277,11 +277,11 @@ def searching(
         return []
     if coarse is None:
         few, seen, modes = p, lattice, 4 * keep
-        sums = yield from _scoring(p, field, T, lattice)
+        sums = yield from _score_in_slices(p, field, T, lattice)
     else:
         few, modes = evenly_spaced(p, config.coarse_points), max(config.coarse_modes, keep)
         seen = make_lattice(coarse, half_widths, step, reach)
-        sums = yield from _scoring(few, coarse, T, seen)
+        sums = yield from _score_in_slices(few, coarse, T, seen)
     yield
     scores = _shares(sums, len(few))
     scores[sums == 0] = -np.inf

@@ -622,7 +622,7 @@ class LidarOdometry:
         for centre in centres:
             R, t = split_pose(centre)
             tries = R @ rotations
-            # every fourth point shows which rotations deserve all of them
+            # every fourth point selects the rotations that are compared with all points
             tries = tries[np.argsort(-self.levels[0].scores(few[::4], tries, t), kind="stable")[:FINALISTS]]
             scores = self.levels[0].scores(few, tries, t)
             for k in np.argsort(-scores, kind="stable")[:best]:

@@ -20,7 +20,7 @@ from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
 from graphslam.registration.config import LEAST_POINTS
 from graphslam.registration.register import Registration, distinct_registrations, register
-from graphslam.registration.search import last_value, searching
+from graphslam.registration.search import last_value, search_in_slices
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam_frontends.segslam.candidate_selection import CandidateSelection, SegmentCandidates, select_candidates
@@ -48,7 +48,7 @@ CLOUD_LEVEL = 1
 SAME_START = 1.0
 """Particles with the same map and predictions closer than about this share one search [m]."""
 SLICE_PARTICLES = 5
-"""Particles whose candidates are selected or judged in one slice."""
+"""Particles whose candidates are selected, or entries drawn, in one slice."""
 RIVALS = 0.15
 """In the maps of other particles of the same steps only those modes are tried that in the first map were worse by at
 most this share of the points, or by ``choice.margin`` if that is larger, so that second modes are not missed."""
@@ -160,9 +160,9 @@ class Matcher:
         seed : SeedTree
             Of this attempt alone.
         """
-        return last_value(self.attempting(step, poses, ahead, seed))
+        return last_value(self.attempt_in_slices(step, poses, ahead, seed))
 
-    def attempting(
+    def attempt_in_slices(
         self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree
     ) -> Generator[None, None, MatchAttempt]:
         """:meth:`attempt` in slices of bounded work; the result is the same."""
@@ -180,16 +180,16 @@ class Matcher:
         if not any(map(len, asked)):
             return nothing
         results, searches, registrations = yield from self._register(source, asked)
-        judged = []
+        posteriors = []
         for i, c in enumerate(asked):
             if i % SLICE_PARTICLES == 0 or config.choice.method != "registration":
                 yield
             proposals = self._proposals(c, results, ahead, seed.child("localise", i))
-            judged.append(match_posterior(proposals, config.choice, config.registration))
+            posteriors.append(match_posterior(proposals, config.choice, config.registration))
         uniform = seed.child("draw").generator().random(len(poses))
         entries: list[SegmentEntry | None] = []
         why: Counter[str] = Counter()
-        for j, u in zip(judged, uniform.tolist()):
+        for j, u in zip(posteriors, uniform.tolist()):
             k = j.draw(u) if len(j.proposals) else NULL
             entries.append(None if k == NULL else j.entry(k, config.choice))
             why.update({name: n for name, n in j.counts().items() if name != "accepted"})
@@ -200,7 +200,7 @@ class Matcher:
             candidates=tuple(sorted({int(s) for c in asked for s in c.segments})),
             searches=searches,
             registrations=registrations,
-            accepted=sum(len(j.accepted) > 0 for j in judged),
+            accepted=sum(len(j.accepted) > 0 for j in posteriors),
             fitness=max(best, default=float("nan")),
             why=dict(sorted(why.items())),
         )
@@ -325,7 +325,7 @@ class Matcher:
         coarse = self._fields.of((*known, 2), lambda: made(2))
         yield
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
-        found = yield from searching(source, fine, T, half, steps, STARTS, coarse=coarse)
+        found = yield from search_in_slices(source, fine, T, half, steps, STARTS, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
         return [p.T for p in found if p.score >= max(LEAST_SCORE, best - SCORE_MARGIN)]
 

@@ -306,7 +306,7 @@ class SegSlamFilter:
         self, k: int, ahead: LookAheadScan, begin: float
     ) -> Generator[None, None, tuple[MatchAttempt, float]]:
         """An attempt, without the time between its slices, and the time from which on the rest counts [s]."""
-        work = self.matcher.attempting(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
+        work = self.matcher.attempt_in_slices(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
         while True:
             try:
                 next(work)
