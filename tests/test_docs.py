@@ -193,8 +193,9 @@ def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_pat
         assert (clone / made).is_file(), made
     demo = clone / "demo-run"
     figures = {p.name for p in (demo / "figures").glob("*.png")}
-    assert {"map.png", "progress.png", "fused_level0.png", "fused_above.png", "fused_cut.png"} <= figures
+    assert {"map.png", "fused_level0.png", "fused_above.png", "fused_cut.png"} <= figures
     assert {"report.html", "map.ply", "map.bt", "map-level0.pgm", "run.json"} <= {p.name for p in demo.iterdir()}
+    assert "progress.png" not in figures
     assert "map_entropy" in done.stdout
     assert str(Path("demo-run") / "figures" / "progress.png") in done.stderr
     assert "8/8 figures" in done.stderr

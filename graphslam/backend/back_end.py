@@ -20,6 +20,7 @@ from graphslam.backend.fix_errors import fit_fix_errors
 from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, repreintegrate_until_converged
 from graphslam.core.control import ControlTable
 from graphslam.core.errors import DataError
+from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
@@ -61,6 +62,9 @@ class Observer:
 
     def stage(self, name: str) -> None:
         """A stage of the run begins, such as ``"front end"`` (:data:`graphslam.app.run.run_bar.STAGES`)."""
+
+    def log_read(self, log: SensorLog) -> None:
+        """The log was read; before any other work."""
 
     def front_end_at(self, progress: Any) -> None:
         """A front end has made a step; the type of ``progress`` depends on the front end."""

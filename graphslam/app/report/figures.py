@@ -31,7 +31,6 @@ CAPTIONS = {
     "gps_residuals.png": "Distances to the GPS fixes",
     "gps_innovations.png": "Withheld GPS fixes against their prediction",
     "loops.png": "Loop closures of landmark submaps: disagreement",
-    "progress.png": "Segments before any loop closure",
 }
 
 MOST_NAMES = 60
@@ -42,15 +41,15 @@ def report_pictures(folder: ReportFolder) -> Markup:
     """All pictures, the map first."""
     made = dict(folder.figures())
     parts: list[Any] = []
-    order = [n for n in CAPTIONS if n in made and n != "progress.png"]
+    order = [n for n in CAPTIONS if n in made]
     levels = [n for n in made if n.startswith("fused_level")]
-    rest = [n for n in made if n not in {*order, *levels, "progress.png"}]
+    rest = [n for n in made if n not in {*order, *levels}]
     at = order.index("submaps.png") + 1 if "submaps.png" in order else min(1, len(order))
     drawn = _drawn(folder)
     for name in order[:at]:
         parts.append(inline_picture(made[name], CAPTIONS[name]))
     parts += drawn
-    for name in [*levels, *order[at:], *rest, *(["progress.png"] if "progress.png" in made else [])]:
+    for name in [*levels, *order[at:], *rest]:
         parts.append(inline_picture(made[name], _caption(name)))
     if not made:
         parts.append(missing_note("plots of the run: figures/ has none."))

@@ -103,9 +103,7 @@ class ReportFolder:
     def figures(self) -> list[tuple[str, bytes]]:
         """Name and bytes of every picture, sorted by name."""
         out = []
-        found = {f.name: f for f in (self.home / "figures").glob("progress.png")}  # drawn during the run
-        found |= {f.name: f for f in (self.path / "figures").glob("*.png")}
-        for _, file in sorted(found.items()):
+        for file in sorted((self.path / "figures").glob("*.png")):
             if file.name.startswith("."):
                 continue
             try:

@@ -72,8 +72,7 @@ SAME_BYTES = (
     *("figures/gps_*.png", "figures/fused*.png"),
 )
 """Files of a run folder that have the same bytes after a kill and a resume, after undoing and redoing a loop, and in
-two runs of one configuration. The others contain times (``timings.json``, and a part of ``report.html``), or were drawn
-during the run (``figures/progress.png``)."""
+two runs of one configuration. The others contain times (``timings.json``, and a part of ``report.html``)."""
 _MADE_OF_MAP = (
     "map.grid.npz",
     "map.kml",

@@ -12,8 +12,9 @@ from graphslam.app.run.attempts import best_map
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.options import FrontEnds, RunOptions, check_names
 from graphslam.app.run.outputs import write_outputs
+from graphslam.app.run.progress_picture import ProgressPicture
 from graphslam.app.run.run import Run
-from graphslam.app.run.run_bar import bar_among
+from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.source import load
 from graphslam.app.run.stages import RunClock
 from graphslam.app.run.submap_slam import SubmapSlam, tell_stage
@@ -60,7 +61,8 @@ def run(
         Continue after the last finished submap of ``out``, to the same result. Loops that were undone stay undone.
     progress : bool or sequence of Observer
         Show a progress bar on stderr; or observers of the run: steps of a front end, submaps, loops, the solution
-        (`graphslam.backend.back_end.Observer`). A `RunBar` among them is used as the progress bar.
+        (`graphslam.backend.back_end.Observer`). A `RunBar` among them is used as the progress bar. With a bar and
+        ``out``, ``figures/progress.png`` shows the map so far until the run has finished.
 
     Returns
     -------
@@ -80,13 +82,17 @@ def run(
     """
     check_names(None if isinstance(source, SensorLog) else frontend, solver)
     RunFolder.check(out, resume=resume)
-    bar, watch = bar_among(progress)
+    observers = [] if isinstance(progress, bool) else list(progress)
+    bar = next((o for o in observers if isinstance(o, RunBar)), None) or RunBar(progress is True)
+    picture = ProgressPicture(Path(out)) if out is not None and bar.shown else None
+    watch = [bar, *([picture] if picture else []), *(o for o in observers if o is not bar)]
     with one_blas_thread(), bar:
         clock = RunClock()
         tell_stage(watch, "reading")
         log = load(source)
         clock.lap("load")
-        bar.log_read(log)
+        for o in watch:
+            o.log_read(log)
         seen = check_streams(log)
         refuse_faulty(seen, log)
         options = RunOptions.for_log(log, frontend, solver, seed, config)
@@ -101,7 +107,11 @@ def run(
             slam = SubmapSlam(options, RecordSource(log), watch, folder)
             result = finish_run(log, slam, clock, [*seen, *findings], undone)
             tell_stage(watch, "figures")
-            return result if folder is None else write_outputs(folder.path, result)
+            if folder is not None:
+                result = write_outputs(folder.path, result)
+            if picture is not None:
+                picture.remove()
+            return result
 
 
 def finish_run(

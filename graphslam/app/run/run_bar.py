@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -21,13 +20,6 @@ STAGES = {
 """Stages of a run in order, with the approximate share of time of each [%]."""
 
 
-def bar_among(progress: bool | Sequence[Observer]) -> tuple[RunBar, list[Observer]]:
-    """The progress bar of a run, and all observers with the bar first."""
-    observers = [] if isinstance(progress, bool) else list(progress)
-    bar = next((o for o in observers if isinstance(o, RunBar)), None) or RunBar(progress is True)
-    return bar, [bar, *(o for o in observers if o is not bar)]
-
-
 class RunBar(Observer):
     """Progress of a run on stderr: the stage, and in the front end the time in the log and the submaps so far.
 
@@ -40,6 +32,7 @@ class RunBar(Observer):
     def __init__(self, shown: bool) -> None:
         layout = "{desc}  {percentage:3.0f} %|{bar:20}| {elapsed}{postfix}"
         delay = 0.5 if sys.stderr is not None and sys.stderr.isatty() else 5.0  # [s] an early error is the only line
+        self.shown = shown
         self._bar = Bar(
             name=next(iter(STAGES)), total=sum(STAGES.values()), shown=shown, bar_format=layout, delay=delay
         )
