@@ -5,7 +5,7 @@
     python tests/benchmarks/bench_victoria_park.py --gps      honest use of GPS: what is withheld, and the laser χ²
     python tests/benchmarks/bench_victoria_park.py --paper    EKF, local maps in sequence, by tree, ours: map, time
                                                               (--seeds N; --figures DIR)
-    python tests/benchmarks/bench_victoria_park.py --quick    the first 200 s only; alone: speed, and the paper's ways
+    python tests/benchmarks/bench_victoria_park.py --quick    the first 160 s only; alone: speed, and the paper's ways
 
 The noise figures are chosen from the columns left of the bar alone. What stands right of it (published identities, GPS)
 is printed to show what the choice is worth, and was not used for it.
@@ -115,7 +115,7 @@ def main() -> None:
         sys.exit(f"cannot run: {error}" if os.environ.get("CI") else print(f"not run: {error}"))
     if args.quick:
         start = log.interval[0]
-        log = log.slice(start, start + 200.0)
+        log = log.slice(start, start + 160.0)
     if args.noise:
         noise(log, args.quick)
     elif args.gps:

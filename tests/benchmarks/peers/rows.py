@@ -90,6 +90,8 @@ ROWS = (
         inputs.scene, (CPU(1.0),), None, ("cold", "peak")),
     Row("planar", "its first half", (), "", "planar", "planar-half", ("radish-intel",), inputs.numbers,
         (CPU(2.144),), None, ("peak",)),  # 2^1.1: exponent of time
+    Row("planar", "its first quarter", (), "", "planar", "planar-quarter", ("simulated",), inputs.name,
+        (CPU(4.595),), None, ("peak",)),  # 4^1.1
     Row("two-cores", "one thread", (), "", "two-threads", "one-thread", ("segslam", "relaxation"), inputs.name,
         (Goal("elapsed", 0.588),), None, ("work",)),  # 1 / 1.7, by the clock: it needs two free cores
     Row("import", "kiss-slam", *SLAM, "import", "kiss-slam-import", ("gs.simulate",), inputs.nothing,
