@@ -44,7 +44,7 @@ def solve_upper(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array
             x[own[s] + c] = v / P[c, c]
 
 
-@njit(fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def solve_lower_units(
     own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
 ) -> tuple[Array, Index]:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
+from graphslam.core.workers import run_tasks
 from graphslam.linear.block_cholesky import BlockFactor
 from graphslam.refine.scans import Scans
 
@@ -177,13 +178,15 @@ class MotionModel:
         e, J = self._increments(poses, states)
         C = np.einsum("kii->ki", self.covariances)
         some = np.unique(np.linspace(0, n - 2, min(SAMPLED, n - 1)).round().astype(np.int64))
-        left = np.empty((len(some), len(self.keep)))
-        for m, k in enumerate(some.tolist()):
+
+        def leverage(k: int) -> Array:
             rows = k * g.dof + np.arange(2 * g.dof)
             rest = [self.nodes[k, 2:4] - n, K + np.arange(self.constants)]
             rows = np.concatenate([rows, n * g.dof + np.concatenate(rest)])
             P = factor.inverse_block(rows)
-            left[m] = 1.0 - np.einsum("ci,ij,cj->c", J[k], P, J[k]) / (C[k] * self.scales**2)
+            return np.asarray(np.einsum("ci,ij,cj->c", J[k], P, J[k]) / (C[k] * self.scales**2))
+
+        left = 1.0 - np.array(run_tasks(leverage, ((k,) for k in some.tolist())))
         left = np.maximum(np.mean(left, axis=0), LEFT)
         # single slips do not affect σ
         r2 = np.minimum(e**2 / C, RARE * self.scales**2)

@@ -9,11 +9,12 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from graphslam.core.geometry import Array
+from graphslam.core.workers import run_tasks
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.refine.fixes import FixModel
 from graphslam.refine.motion import MotionModel, MotionTerms, States
-from graphslam.refine.surfaces import ScanReturns, SurfacePairs, Surfaces, row_blocks
+from graphslam.refine.surfaces import ScanReturns, SurfacePairs, Surfaces, over_rows, rotate_by_step
 from graphslam.registration.plane_kernels import (
     GroupInformation,
     PlanePairs,
@@ -25,6 +26,11 @@ from graphslam.registration.plane_kernels import (
 from graphslam.registration.surfaces import rotations
 
 Index = npt.NDArray[np.int64]
+
+
+def halves(n: int) -> tuple[slice, slice]:
+    """Rows that are added on their own, always in two sums: these do not depend on the number of threads."""
+    return slice(0, n // 2), slice(n // 2, n)
 
 
 class BlockStructure:
@@ -62,9 +68,12 @@ class BlockStructure:
     def at(self, a: Index, b: Index) -> Index:
         """Offsets of blocks; their rows are those of the node that is eliminated first."""
         out = np.empty(len(a), np.int64)
-        for s in row_blocks(len(a)):
+
+        def find(s: slice) -> None:
             rows, columns = self._sorted(a[s], b[s])
             out[s] = self.offset[np.searchsorted(self.keys, rows * self.N + columns)]
+
+        over_rows(find, len(a))
         return out
 
     def add(self, terms: MotionTerms, H: Array, g: Array) -> float:
@@ -126,8 +135,11 @@ def pair_noise(pairs: SurfacePairs, residuals: Array) -> Array:
         for c in np.array_split(order, BINS)
         for part in np.array_split(np.argsort(pairs.once[c, 2], kind="stable"), BINS)
     ]
-    A = np.array([np.median(pairs.once[c], axis=0) for c in classes])
-    v = np.array([(1.4826 * np.median(np.abs(residuals[c]))) ** 2 for c in classes])
+
+    def medians(c: Index) -> tuple[Array, float]:
+        return np.median(pairs.once[c], axis=0), (1.4826 * np.median(np.abs(residuals[c]))) ** 2
+
+    A, v = map(np.array, zip(*run_tasks(medians, ((c,) for c in classes))))
     # a step's own pose absorbs a part of the motion error: classes dominated by motion have too small residuals
     ruled = A[:, 2] / np.maximum(v, LEAST_SPREAD**2)
     some = ruled <= max(MOTION, float(np.quantile(ruled, 0.25)))
@@ -193,24 +205,31 @@ def correlation_factor(found: SurfacePairs, cloud: ScanReturns, residuals: Array
     z = residuals[good] / np.sqrt(v[good])
     moved = np.sqrt(found.once[good, 2] * noise[2] / v[good])
     order = p - np.searchsorted(cloud.step, i)
-    out = 1.0
-    for length in (ALIKE, len(cloud.points)):
+
+    def ratio(length: int) -> float:
         key = (m * (int(i.max()) + 1) + i) * (int(order.max()) // length + 1) + order // length
         key = np.unique(key, return_inverse=True)[1]
         shared, times = np.unique(key * len(cloud.points) + q, return_counts=True)
         own = np.bincount(key, weights=1.0 - moved**2) / np.bincount(key)
         targets = np.bincount(shared // len(cloud.points), weights=times.astype(float) ** 2)
         wanted = 0.5 * own * (np.bincount(key) + targets) + np.bincount(key, weights=moved) ** 2
-        if len(wanted) >= FEWEST_SUMS:
-            out = max(out, float(np.sum(np.bincount(key, weights=z) ** 2) / np.sum(wanted)))
-    return out
+        if len(wanted) < FEWEST_SUMS:
+            return 1.0
+        return float(np.sum(np.bincount(key, weights=z) ** 2) / np.sum(wanted))
+
+    return max(1.0, *run_tasks(ratio, ((ALIKE,), (len(cloud.points),))))
 
 
 def surface_residuals(pairs: PlanePairs, cloud: ScanReturns, surfaces: Surfaces, poses: Array) -> Array:
     """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
     out = np.empty(len(pairs.source))
     t = np.ascontiguousarray(poses[:, : cloud.points.shape[1]])
-    plane_residuals(pairs, rotations(poses), t, cloud.points, surfaces.normals, out)
+    R = rotations(poses)
+
+    def fill(s: slice) -> None:
+        plane_residuals(pairs.some(s), R, t, cloud.points, surfaces.normals, out[s])
+
+    over_rows(fill, len(out))
     return out
 
 
@@ -236,14 +255,17 @@ def chunk_information(
         return no_noise_correction(d)
     w, G = (6 if d == 3 else 3), int(group.max()) + 1
     R, t = rotations(poses), np.ascontiguousarray(poses[:, :d])
-    centre = np.zeros((G, d))
-    for s in row_blocks(len(group)):
-        x = np.einsum("kij,kj->ki", R[pairs.j[s]], cloud.points[pairs.target[s]]) + t[pairs.j[s]]
-        np.add.at(centre, group[s], x)
+    x = rotate_by_step(R, pairs.j, cloud.points[pairs.target], t)
+    centre: Array = np.stack([np.bincount(group, x[:, k], G) for k in range(d)], axis=1, dtype=np.float64)
     centre /= np.maximum(np.bincount(group, minlength=G), 1)[:, None]
-    H, F = np.zeros((G, w, w)), np.zeros((G, w, w))
     surfaces_of = (cloud.points, surfaces.normals, surfaces.tilts)
-    group_information(pairs, (R, t), surfaces_of, information, (group, centre), H, F)
+    sums = np.zeros((2, 2, G, w, w))
+
+    def add(s: slice, out: Array) -> None:
+        group_information(pairs.some(s), (R, t), surfaces_of, information[s], (group[s], centre), out[0], out[1])
+
+    run_tasks(add, zip(halves(len(group)), sums))
+    H, F = sums[0] + sums[1]
     size = np.einsum("mii->mi", H + F) + 1e-12
     L = np.linalg.cholesky(F + 1e-9 * np.eye(w) * size[:, None, :])
     values, U = np.linalg.eigh(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, H), 1, 2)))
@@ -309,14 +331,19 @@ class RefinementProblem:
         gp = np.zeros((n, w))
         own = np.arange(n)
         R, t = rotations(poses), np.ascontiguousarray(poses[:, : motion.group.dim])
-        parts = {
-            "scans": plane_blocks(
-                pairs, (R, t), (self.cloud.points, surfaces.normals), information,
-                (pattern.at(own, own), pattern.at(pairs.i, pairs.j), pattern.rank),
-                holds or no_noise_correction(motion.group.dim), H, gp,
-            )
-        }  # fmt: skip
-        g[: n * w] = gp.ravel()
+        first, offset = pattern.at(own, own), pattern.at(pairs.i, pairs.j)
+        held = holds or no_noise_correction(motion.group.dim)
+
+        def add(s: slice, H: Array, g: Array) -> float:
+            slots, groups = (first, offset[s], pattern.rank), held._replace(group=held.group[s])
+            clouds = self.cloud.points, surfaces.normals
+            return plane_blocks(pairs.some(s), (R, t), clouds, information[s], slots, groups, H, g)
+
+        other, gq = np.zeros_like(H), np.zeros_like(gp)
+        parts = {"scans": sum(run_tasks(add, zip(halves(len(pairs.source)), (H, other), (gp, gq))))}
+        H += other
+        del other
+        g[: n * w] = (gp + gq).ravel()
         for terms in [*motion.terms(poses, states), motion.gauge(poses, self.held), *more]:
             parts[terms.name] = parts.get(terms.name, 0.0) + pattern.add(terms, H, g)
         factor = pattern.symbolic.factor(pattern.offset, H)

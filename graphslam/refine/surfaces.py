@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
 from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
+from graphslam.core.workers import run_tasks
 from graphslam.refine.scans import Scans
 from graphslam.registration.plane_kernels import PlanePairs
 from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, rotations, thin_places
@@ -25,17 +28,30 @@ or of a ceiling are never matched."""
 BLOCK = 1 << 16
 """Rows that are processed together: a matrix for each point of a long log would take gigabytes."""
 
+TOGETHER = 1 << 12
+"""Points whose neighbours are searched together."""
+
 
 def row_blocks(n: int) -> Iterator[slice]:
     """Slices of ``0 … n`` with at most :data:`BLOCK` rows."""
     return (slice(k, min(k + BLOCK, n)) for k in range(0, n, BLOCK))
 
 
-def rotate_by_step(R: Array, step: Index, x: Array) -> Array:
-    """``R_step x`` of vectors ``(q, d)``, each by the rotation ``(n, d, d)`` of its own step."""
+def over_rows(work: Callable[[slice], Any], n: int) -> None:
+    """``work(s)`` for blocks of ``n`` rows, on all cores."""
+    run_tasks(work, ((s,) for s in row_blocks(n)))
+
+
+def rotate_by_step(R: Array, step: Index, x: Array, t: Array | None = None) -> Array:
+    """``R_step x + t_step`` of vectors ``(q, d)``, each by the pose ``(n, d, d)``, ``(n, d)`` of its own step."""
     out = np.empty(x.shape)
-    for s in row_blocks(len(x)):
+
+    def turn(s: slice) -> None:
         np.einsum("kij,kj->ki", R[step[s]], x[s], out=out[s])
+        if t is not None:
+            out[s] += t[step[s]]
+
+    over_rows(turn, len(x))
     return out
 
 
@@ -105,13 +121,16 @@ class ScanReturns:
 
         def moved(x: Array) -> Array:
             out = np.empty(x.shape)
-            for s in row_blocks(len(x)):
+
+            def move(s: slice) -> None:
                 c = -self.age[s, None] * corrections[self.step[s]]  # small, so first order suffices
                 y = x[s]
                 if x.shape[1] == 3:
                     out[s] = y + np.cross(c[:, :3], y) + c[:, 3:]
                 else:
                     out[s] = y + c[:, :2] + c[:, 2:] * np.column_stack([-y[:, 1], y[:, 0]])
+
+            over_rows(move, len(x))
             return out
 
         return replace(self, points=moved(self.points), origins=moved(self.origins))
@@ -130,10 +149,7 @@ class ScanReturns:
     def world(self, poses: Array) -> tuple[Array, Array]:
         """Points and origins ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
         R, t = rotations(poses), poses[:, : self.points.shape[1]]
-        W, O = rotate_by_step(R, self.step, self.points), rotate_by_step(R, self.step, self.origins)
-        for x in (W, O):
-            for s in row_blocks(len(x)):
-                x[s] += t[self.step[s]]
+        W, O = rotate_by_step(R, self.step, self.points, t), rotate_by_step(R, self.step, self.origins, t)
         return W, O
 
 
@@ -177,12 +193,20 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
     normals, flat = np.zeros((q, d)), np.zeros(q, bool)
     tilts = np.zeros((q, d - 1, d), np.float32)
     stands = np.arange(q)
-    places = [thin_places(W, cloud.rows[c], cloud.rows[c + 1], config.spacing, stands) for c in range(cloud.chunks)]
-    for c, own in enumerate(places):
-        if not len(own):
-            continue
-        near = np.concatenate(places[max(c - 1, 0) : c + 2])
-        normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config)
+    rows = cloud.rows
+    places = run_tasks(lambda a, b: thin_places(W, a, b, config.spacing, stands), pairwise(rows.tolist()))
+
+    def tasks() -> Iterator[tuple[Index, Index, cKDTree]]:
+        for c, own in enumerate(places):
+            near = np.concatenate(places[max(c - 1, 0) : c + 2])
+            tree = cKDTree(W[near]) if len(own) else None
+            for s in range(0, len(own), TOGETHER):
+                yield own[s : s + TOGETHER], near, tree
+
+    def fit(own: Index, near: Index, tree: cKDTree) -> None:
+        normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config, tree)
+
+    run_tasks(fit, tasks())
     back = np.swapaxes(rotations(poses), 1, 2)
     for a in range(d - 1):
         tilts[:, a] = rotate_by_step(back, cloud.step, tilts[:, a])
@@ -311,19 +335,22 @@ def match_surfaces(
     i, j = cloud.step[p], cloud.step[q]
     shared = None if within is None else [ALIKE * np.bincount(k, minlength=len(within)) for k in (i, j)]
     once, spent = np.zeros((len(p), 3)), np.zeros((len(p), 3))
-    for s in row_blocks(len(p)):
+
+    def fill(s: slice) -> None:
         a, b, n = p[s], q[s], N[q[s]]
         cp, cq = (np.asarray((np.einsum("ki,ki->k", n, O[rows]) / beam[rows]) ** 2) for rows in (a, b))
         once[s, 0], once[s, 1] = cp + cq, 1.0
         spent[s, 0], spent[s, 1] = mp[s] * cp + mq[s] * cq, 0.5 * (mp[s] + mq[s])
         if within is None or shared is None:
-            continue
+            return
         own = np.einsum("kji,kj->ki", R[i[s]], n), surfaces.normals[b]
         for rows, k, m, times, alike_steps in zip((a, b), (i[s], j[s]), own, (mp[s], mq[s]), shared):
             lever = _lever(cloud.points[rows], m)
             v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
             once[s, 2] += v
             spent[s, 2] += v * np.maximum(times, alike_steps[k])
+
+    over_rows(fill, len(p))
     return SurfacePairs(PlanePairs(p, q, i, j), w, once, spent)
 
 
@@ -348,28 +375,31 @@ def _nearest_surfaces(
             trees[c] = (cKDTree(W[rows]) if len(rows) else None, rows)
         return trees[c]
 
-    found_p, found_q, whose = [], [], []
-    passes = chunks.passes
-    for m, (a, b) in enumerate(zip(chunks.a.tolist(), chunks.b.tolist())):
-        t, rows = tree(b)
-        if last[b] == m:
-            del trees[b]
-        p = np.arange(cloud.rows[a], cloud.rows[a + 1], every)
-        p = p[surfaces.flat[surfaces.stands[p]]]
+    def tasks() -> Iterator[tuple[int, Index, cKDTree, Index]]:
+        for m, (a, b) in enumerate(zip(chunks.a.tolist(), chunks.b.tolist())):
+            t, rows = tree(b)
+            if last[b] == m:
+                del trees[b]
+            p = np.arange(cloud.rows[a], cloud.rows[a + 1], every)
+            yield m, p[surfaces.flat[surfaces.stands[p]]], t, rows
+
+    passes, none = chunks.passes, np.zeros(0, np.int64)
+
+    def nearest(m: int, p: Index, t: cKDTree, rows: Index) -> tuple[Index, Index, Index]:
         if t is None or len(p) == 0:
-            continue
+            return none, none, none
         _, at = t.query(W[p], k=1, distance_upper_bound=distance)
         some, tried = at < len(rows), len(p)
         q, p = rows[at[some]], p[some]
         good = np.einsum("ki,ki->k", N[surfaces.stands[p]], N[q]) > SAME_SIDE
         p, q = p[good], q[good]
         if passes[m] and len(p) < least_share * tried:
-            continue
-        found_p.append(p)
-        found_q.append(q)
-        whose.append(np.full(len(p), m))
-    none = np.zeros(0, np.int64)
-    return np.concatenate([none, *found_p]), np.concatenate([none, *found_q]), np.concatenate([none, *whose])
+            return none, none, none
+        return p, q, np.full(len(p), m)
+
+    found = [(none, none, none), *run_tasks(nearest, tasks())]
+    p, q, whose = (np.concatenate([f[k] for f in found]) for k in range(3))
+    return p, q, whose
 
 
 def _lever(points: Array, normals: Array) -> Array:

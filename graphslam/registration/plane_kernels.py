@@ -29,6 +29,10 @@ class PlanePairs(NamedTuple):
     i: Index
     j: Index
 
+    def some(self, rows: slice) -> PlanePairs:
+        """A part of the pairs."""
+        return PlanePairs(*(x[rows] for x in self))
+
 
 @callee
 def symmetric_eigen(A: Array, w: Array, V: Array) -> None:
@@ -125,7 +129,7 @@ def principal_axes(points: Array, neighbours: Index, out_spread: Array, out_axes
         symmetric_eigen(C, out_spread[k], out_axes[k])
 
 
-@njit(fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def fit_surfaces(
     points: Array, neighbours: Index, least: int, out_normal: Array, out_flat: Array, out_tilt: Array
 ) -> None:
@@ -163,7 +167,7 @@ def fit_surfaces(
         out_flat[k, 0], out_flat[k, 1], out_flat[k, 2] = w[0], w[d - 2], w[d - 1]
 
 
-@njit(fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def plane_residuals(pairs: PlanePairs, R: Array, t: Array, points: Array, normals: Array, out: Array) -> None:
     """``n_jᵀ (T_j⁻¹ T_i p - q)`` of every pair.
 
@@ -234,7 +238,7 @@ def normal_jacobian(x: Array, n: Array, out: Array) -> None:
         out[0], out[1], out[2] = n[0], n[1], x[0] * n[1] - x[1] * n[0]
 
 
-@njit(fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def group_information(
     pairs: PlanePairs,
     poses: tuple[Array, Array],
@@ -313,7 +317,7 @@ def _share_of(share: Array, m: int, J: Array, out: Array) -> None:
             out[u] += share[m, u, v] * J[v]
 
 
-@njit(fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def plane_blocks(
     pairs: PlanePairs,
     poses: tuple[Array, Array],

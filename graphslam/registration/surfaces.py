@@ -58,7 +58,9 @@ def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Inde
     return np.sort(a + first)
 
 
-def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceFitConfig) -> tuple[Array, Array, Flags]:
+def fit_places(
+    W: Array, O: Array, own: Index, near: Index, config: SurfaceFitConfig, tree: cKDTree | None = None
+) -> tuple[Array, Array, Flags]:
     """Planes of places among their neighbours.
 
     Parameters
@@ -69,6 +71,8 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceFitCo
         Rows of the places to fit.
     near : (m,)
         Rows of the possible neighbours, including ``own``.
+    tree : cKDTree, optional
+        Of the points of ``near``, if it is already there.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceFitCo
     """
     d = W.shape[1]
     k = min(config.neighbours, len(near))
-    _, at = cKDTree(W[near]).query(W[own], k=k, distance_upper_bound=config.radius)
+    _, at = (tree or cKDTree(W[near])).query(W[own], k=k, distance_upper_bound=config.radius)
     at = at.reshape(len(own), k).astype(np.int64)
     rows = np.append(near, -1)[at]
     n, w, tilts = np.zeros((len(own), d)), np.zeros((len(own), 3)), np.zeros((len(own), d - 1, d))

@@ -68,6 +68,17 @@ def _grown(table):
 
 
 @njit(nogil=True)
+def add_block_table(table, other):
+    """Add the blocks of another table; returns the table, as it may have grown."""
+    keys = sorted_block_keys(other)
+    for i in range(len(keys)):
+        if table.filled[0] == len(table.block):
+            table = _grown(table)
+        table.block[_find(table, keys[i])] += other.block[i]
+    return table
+
+
+@njit(nogil=True)
 def sorted_block_keys(table):
     """Keys in the order of the blocks."""
     keys = np.empty(table.filled[0], np.int64)

@@ -17,6 +17,8 @@ from graphslam.skeleton.block_table_kernels import _find, _grown
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 Array = npt.NDArray[np.float64]
+_TOGETHER = 6
+"""2^6 consecutive landmarks are of one part: two threads do not write to one cache line."""
 
 
 class PendingLandmarks(NamedTuple):
@@ -52,7 +54,7 @@ def make_pending(landmarks):
 
 
 @callee(error_model="numpy")
-def _sum_interval(detections, poses, interval, slot, ids, sums):
+def _sum_interval(detections, poses, interval, some, slot, ids, sums):
     """Sums over the poses of one interval, one row per observed landmark; ``slot`` is initially zero.
 
     A row: Σ h₀ W, Σ h₁ W, Σ h₀ h₀ W, Σ h₀ h₁ W, Σ h₁ h₁ W (six values each), number of observations.
@@ -61,6 +63,8 @@ def _sum_interval(detections, poses, interval, slot, ids, sums):
     ----------
     interval : (a, b, end)
         Keyframes at poses a and b; poses ``a … end - 1``.
+    some : (part, parts)
+        Only landmarks of this part; a power of two parts.
 
     Returns
     -------
@@ -68,6 +72,7 @@ def _sum_interval(detections, poses, interval, slot, ids, sums):
         Number of rows.
     """
     a, b, end = interval
+    part, parts = some
     n = 0
     for i in range(a, end):
         h1 = (i - a) / (b - a)
@@ -75,8 +80,10 @@ def _sum_interval(detections, poses, interval, slot, ids, sums):
         h00, h01, h11 = h0 * h0, h0 * h1, h1 * h1
         R = _nine(poses.rotation, i)
         for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
-            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             j = detections.landmark[m]
+            if (j >> _TOGETHER) & (parts - 1) != part:
+                continue
+            nx, ny, nz, al, be = _seen(R, detections, m)[3:]
             e = slot[j]
             if e == 0:
                 ids[n] = j
@@ -191,7 +198,7 @@ def keyframe_diagonal(detections, poses, landmarks, k, begin, end, out):
     for c in range(first, end):
         n1 = 0
         if c < K - 1:
-            n1 = _sum_interval(detections, poses, _interval(c, k, N), slot1, ids1, sums1)
+            n1 = _sum_interval(detections, poses, _interval(c, k, N), (0, 1), slot1, ids1, sums1)
         if c >= begin:
             at = min(c * k, N - 1)
             px, py, pz = poses.position[at, 0], poses.position[at, 1], poses.position[at, 2]
@@ -264,7 +271,7 @@ def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
 
 @njit(nogil=True)
 def keyframe_network(detections, poses, landmarks, k, span, count, waiting, table):
-    """Add the blocks of ``Pᵀ S P`` from measurements to ``table``, interval by interval.
+    """Add the blocks of ``Pᵀ S P`` from measurements of some landmarks to ``table``, interval by interval.
 
     Returns the pending landmarks and the table, as both may have grown.
 
@@ -274,8 +281,9 @@ def keyframe_network(detections, poses, landmarks, k, span, count, waiting, tabl
     Parameters
     ----------
     landmarks : (l (L, 3), D⁻¹ (L, 6))
-    span : (begin, end)
-        Intervals between keyframes; to be called for all of them in order.
+    span : (begin, end, part, parts)
+        Intervals between keyframes; to be called for all of them in order. Only landmarks of this part; a power of two
+        parts.
     count : (L,) int32
         Remaining observations of each landmark; changed.
     """
@@ -292,7 +300,7 @@ def keyframe_network(detections, poses, landmarks, k, span, count, waiting, tabl
     B00, B01, B11 = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     T = np.empty((3, 6))
     for c in range(span[0], span[1]):
-        n = _sum_interval(detections, poses, _interval(c, k, N), slot, ids, sums)
+        n = _sum_interval(detections, poses, _interval(c, k, N), span[2:], slot, ids, sums)
         if used + 2 * n > room:  # all may be new
             room = 2 * (used + 2 * n)
             frame, after, kept = _longer(frame, after, kept, room)
@@ -384,17 +392,21 @@ def _doubled(values):
 
 
 @callee
-def _carried(A, left, right, h, T):
+def _offset(position, a, i):
+    return position[i, 0] - position[a, 0], position[i, 1] - position[a, 1], position[i, 2] - position[a, 2]
+
+
+@callee
+def _carried(A, left, right, h, M, T):
     """``T = h · Cₗᵀ A Cᵣ`` with C = [[I, 0], [-[d]×, I]] for the offsets ``left`` and ``right`` from a keyframe."""
-    M = np.empty((6, 6))
-    x, y, z = right[0], right[1], right[2]
+    x, y, z = right
     for r in range(6):  # A Cᵣ: the rotation columns get -A_u [d]
         a, b, c = A[r, 3], A[r, 4], A[r, 5]
         M[r, 0] = h * (A[r, 0] - (b * z - c * y))
         M[r, 1] = h * (A[r, 1] - (c * x - a * z))
         M[r, 2] = h * (A[r, 2] - (a * y - b * x))
         M[r, 3], M[r, 4], M[r, 5] = h * a, h * b, h * c
-    x, y, z = left[0], left[1], left[2]
+    x, y, z = left
     for c2 in range(6):  # Cₗᵀ M: the rotation rows get [d] M_u
         a, b, c = M[3, c2], M[4, c2], M[5, c2]
         T[0, c2] = M[0, c2] - z * b + y * c
@@ -407,31 +419,31 @@ def _carried(A, left, right, h, T):
 def keyframe_chain(position, diagonal, upper, k, out_diagonal, out_upper):
     """Add ``Pᵀ A P`` of a chain of blocks to ``out_diagonal (K, 6, 6)`` and ``out_upper (K - 1, 6, 6)``."""
     N, K = len(position), len(out_diagonal)
-    T = np.empty((6, 6))
+    M, T = np.empty((6, 6)), np.empty((6, 6))
     for c in range(K - 1):
         a, b, end = _interval(c, k, N)
         for i in range(a, end):
             h1 = (i - a) / (b - a)
             h0 = 1.0 - h1
-            d0, d1 = position[i] - position[a], position[i] - position[b]
-            _carried(diagonal[i], d0, d0, h0 * h0, T)
+            d0, d1 = _offset(position, a, i), _offset(position, b, i)
+            _carried(diagonal[i], d0, d0, h0 * h0, M, T)
             out_diagonal[c] += T
-            _carried(diagonal[i], d1, d1, h1 * h1, T)
+            _carried(diagonal[i], d1, d1, h1 * h1, M, T)
             out_diagonal[c + 1] += T
-            _carried(diagonal[i], d0, d1, h0 * h1, T)
+            _carried(diagonal[i], d0, d1, h0 * h1, M, T)
             out_upper[c] += T
             if i + 1 >= N:
                 continue
             g1 = (i + 1 - a) / (b - a)
             g0 = 1.0 - g1
-            e0, e1 = position[i + 1] - position[a], position[i + 1] - position[b]
-            _carried(upper[i], d0, e0, h0 * g0, T)
+            e0, e1 = _offset(position, a, i + 1), _offset(position, b, i + 1)
+            _carried(upper[i], d0, e0, h0 * g0, M, T)
             _both(T, out_diagonal[c])
-            _carried(upper[i], d1, e1, h1 * g1, T)
+            _carried(upper[i], d1, e1, h1 * g1, M, T)
             _both(T, out_diagonal[c + 1])
-            _carried(upper[i], d0, e1, h0 * g1, T)
+            _carried(upper[i], d0, e1, h0 * g1, M, T)
             out_upper[c] += T
-            _carried(upper[i], d1, e0, h1 * g0, T)
+            _carried(upper[i], d1, e0, h1 * g0, M, T)
             for r in range(6):
                 for s in range(6):
                     out_upper[c, r, s] += T[s, r]

@@ -14,8 +14,9 @@ from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import coarse_kernels as kernels
-from graphslam.skeleton.block_table_kernels import make_block_table, sorted_block_keys
-from graphslam.skeleton.schur import Network, inverse_of
+from graphslam.skeleton.block_table_kernels import add_block_table, make_block_table, sorted_block_keys
+from graphslam.skeleton.landmark_kernels import Detections
+from graphslam.skeleton.schur import PARTS, Network, inverse_of
 
 Index = npt.NDArray[np.int64]
 
@@ -82,11 +83,20 @@ class KeyframeNetwork:
         problem, poses = network.layout.problem, network.poses
         self.k, self.frames, self.position = k, keyframes_of(problem.poses, k), poses.position
         count = network.layout.counts.copy()
-        table = make_block_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
-        landmarks, waiting = (network.landmarks, network.inverse), kernels.make_pending(problem.landmarks)
+        size = max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3)
+        landmarks = network.landmarks, network.inverse
+        parts = [(kernels.make_pending(problem.landmarks), make_block_table(size)) for _ in range(PARTS)]
+
+        def add(part: int, a: int, b: int, sight: Detections) -> None:
+            span = a, b, part, PARTS
+            parts[part] = kernels.keyframe_network(sight, poses, landmarks, k, span, count, *parts[part])
+
         for a, b in _interval_chunks(network, k, 0, self.frames - 1):
             sight = problem.observations_of(*_poses_of(problem.poses, k, a, b))
-            waiting, table = kernels.keyframe_network(sight, poses, landmarks, k, (a, b), count, waiting, table)
+            network.layout.workers.over(add, [(p, a, b, sight) for p in range(PARTS)])
+        table = parts[0][1]
+        for _, other in parts[1:]:
+            table = add_block_table(table, other)
         keys = sorted_block_keys(table)
         self.blocks = table.block[: len(keys)]
         diagonal, upper = keyframe_chain_blocks(network, k)
@@ -113,11 +123,15 @@ class KeyframeNetwork:
         diagonal = sp.block_diag(list(self.blocks[order][ptr[:-1]]), format="csr")
         return sp.csr_matrix(upper + upper.T - diagonal)
 
-    def apply(self, r: Array, out: Array) -> None:
-        """Add ``P (Pᵀ S P)⁻¹ Pᵀ r`` to ``out (N, 6)``."""
+    def restricted(self, r: Array) -> Array:
+        """``(Pᵀ S P)⁻¹ Pᵀ r``"""
         x = np.empty((self.frames, 6))
         kernels.restrict_residual(self.position, self.k, r, x)
-        kernels.prolong_step(self.position, self.k, self.solve(x), out)
+        return self.solve(x)
+
+    def apply(self, r: Array, out: Array) -> None:
+        """Add ``P (Pᵀ S P)⁻¹ Pᵀ r`` to ``out (N, 6)``."""
+        kernels.prolong_step(self.position, self.k, self.restricted(r), out)
 
 
 def keyframes_of(poses: int, k: int) -> int:
@@ -188,13 +202,22 @@ class Preconditioner:
     def __call__(self, r: Array) -> Array:
         """``M⁻¹ r`` for ``r (N, 6)``."""
         out = np.empty_like(r)
-        self.layout.over_poses(lambda a, b: chains.multiply_blocks(self.inverse, r, a, b, out))
-        if self.keyframes is not None:
-            k, n = self.levels.jacobi, len(self.keyframes)
-            x, y = np.empty((n, 6)), np.empty((n, 6))
-            kernels.restrict_residual(self.position, k, r, x)
-            chains.multiply_blocks(self.keyframes, x, 0, n, y)
-            kernels.prolong_step(self.position, k, y, out)
-        if self.network is not None:
-            self.network.apply(r, out)
+
+        def fine() -> None:
+            for a, b in self.layout.problem.chunks(0, len(r)):
+                chains.multiply_blocks(self.inverse, r, a, b, out)
+            if self.keyframes is not None:
+                k, n = self.levels.jacobi, len(self.keyframes)
+                x, y = np.empty((n, 6)), np.empty((n, 6))
+                kernels.restrict_residual(self.position, k, r, x)
+                chains.multiply_blocks(self.keyframes, x, 0, n, y)
+                kernels.prolong_step(self.position, k, y, out)
+
+        network = self.network
+        if network is None:
+            fine()
+            return out
+        tasks = [(lambda: network.restricted(r),), (fine,)]
+        coarse = self.layout.workers.over(lambda task: task(), tasks)[0]
+        kernels.prolong_step(self.position, network.k, coarse, out)
         return out

@@ -262,33 +262,29 @@ def relax_skeleton(
             walk = forward_pass(problem, poses)
             poses, refused = walk.poses, walk.refused
             stages("forward pass")
-    workers = Workers(c.threads)
-    try:
-        descent = _Descent(problem, c, workers, poses, stages, progress)
+    descent = _Descent(problem, c, Workers(c.threads), poses, stages, progress)
+    descent.run()
+    while c.split and descent.split():
         descent.run()
-        while c.split and descent.split():
-            descent.run()
-        soft = weakest_modes(descent.network, c.soft) if c.soft else []
-        stages("softest modes")
-        network = descent.network
-        return RelaxationResult(
-            method=c.method,
-            poses=network.poses,
-            landmarks=network.landmarks,
-            landmark=descent.problem.landmark,
-            objective=network.objective,
-            chi2=network.objective / max(1, descent.problem.freedom),
-            gradient=float(np.linalg.norm(network.gradient)),
-            converged=descent.converged,
-            history=descent.history,
-            soft=soft,
-            split=descent.found,
-            refused=refused,
-            seconds=stages.seconds,
-            approximate=c.method == "levels",
-        )
-    finally:
-        workers.close()
+    soft = weakest_modes(descent.network, c.soft) if c.soft else []
+    stages("softest modes")
+    network = descent.network
+    return RelaxationResult(
+        method=c.method,
+        poses=network.poses,
+        landmarks=network.landmarks,
+        landmark=descent.problem.landmark,
+        objective=network.objective,
+        chi2=network.objective / max(1, descent.problem.freedom),
+        gradient=float(np.linalg.norm(network.gradient)),
+        converged=descent.converged,
+        history=descent.history,
+        soft=soft,
+        split=descent.found,
+        refused=refused,
+        seconds=stages.seconds,
+        approximate=c.method == "levels",
+    )
 
 
 class _Descent:

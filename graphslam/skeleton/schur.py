@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat, so3_left_jacobian_inverse, so3_log
+from graphslam.core.workers import run_tasks
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import landmark_kernels as kernels
 from graphslam.skeleton.landmark_kernels import Detections, Poses
@@ -26,18 +26,10 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def over(self, work: Callable[..., Any], ranges: Any) -> list[Any]:
         """``[work(*r) for r in ranges]``, in that order."""
-        if self._pool is None:
-            return [work(*r) for r in ranges]
-        return [f.result() for f in [self._pool.submit(work, *r) for r in ranges]]
-
-    def close(self) -> None:
-        """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        return run_tasks(work, ranges, self.threads)
 
 
 class WorkRanges:

@@ -106,7 +106,6 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
     M(v)
     costs["apply"] = time.process_time() - begin
     at_truth = Network(layout, truth).objective
-    workers.close()
     return {
         "poses": poses,
         "measurements": problem.measurements,

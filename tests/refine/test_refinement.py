@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.backend.refining import refinement_findings, wrong_loops
+from graphslam.core import workers
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
@@ -61,6 +62,16 @@ def test_dead_reckoning_is_brought_to_the_truth(drives):
         assert error(scans.times, found.poses, truth) < 0.02
         assert found.better
         assert found.agreement[1] > 0.8
+
+
+def test_threads_change_no_byte_of_a_refinement(monkeypatch):
+    scans, start, _ = court(SEEDS[0])
+    found = []
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(workers, "cores", lambda n=threads: n)
+        made = refine_by_scans(scans, start)
+        found.append((made.poses.tobytes(), made.covariances.tobytes(), made.agreement))
+    assert found[0] == found[1] == found[2]
 
 
 def test_the_covariance_is_neither_too_small_nor_too_large(drives):
