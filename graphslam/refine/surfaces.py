@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
 from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
-from graphslam.core.workers import run_tasks
+from graphslam.core.workers import cores, run_tasks
 from graphslam.refine.scans import Scans
 from graphslam.registration.plane_kernels import PlanePairs
 from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, rotations, thin_places
@@ -27,9 +27,6 @@ SAME_SIDE = 0.85
 or of a ceiling are never matched."""
 BLOCK = 1 << 16
 """Rows that are processed together: a matrix for each point of a long log would take gigabytes."""
-
-TOGETHER = 1 << 12
-"""Points whose neighbours are searched together."""
 
 
 def row_blocks(n: int) -> Iterator[slice]:
@@ -199,9 +196,11 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
     def tasks() -> Iterator[tuple[Index, Index, cKDTree]]:
         for c, own in enumerate(places):
             near = np.concatenate(places[max(c - 1, 0) : c + 2])
-            tree = cKDTree(W[near]) if len(own) else None
-            for s in range(0, len(own), TOGETHER):
-                yield own[s : s + TOGETHER], near, tree
+            if not len(own):
+                continue
+            tree = cKDTree(W[near])
+            for some in np.array_split(own, cores()):
+                yield some, near, tree
 
     def fit(own: Index, near: Index, tree: cKDTree) -> None:
         normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config, tree)

@@ -87,7 +87,8 @@ def fit_places(
     k = min(config.neighbours, len(near))
     _, at = (tree or cKDTree(W[near])).query(W[own], k=k, distance_upper_bound=config.radius)
     at = at.reshape(len(own), k).astype(np.int64)
-    rows = np.append(near, -1)[at]
+    rows = near.take(at, mode="clip")
+    rows[at == len(near)] = -1  # no neighbour
     n, w, tilts = np.zeros((len(own), d)), np.zeros((len(own), 3)), np.zeros((len(own), d - 1, d))
     fit_surfaces(W, rows, 2 * d, n, w, tilts)
     middle = w[:, 1 if d == 3 else 2]

@@ -123,7 +123,7 @@ def measured(row: Row, case: str, options: argparse.Namespace) -> tuple[dict[str
             who = ("ours", row.peer)[side]
             try:
                 figures, arrays = one_run(
-                    [*command, work], folder, folder / f"{side}.json", options.timeout, every_core=wide
+                    [*command, work], folder, folder / f"{side}.json", options.timeout, every_core=wide and not side
                 )
             except PeerError as error:
                 raise PeerError(f"{who} {error}") from None

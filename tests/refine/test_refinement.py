@@ -14,6 +14,7 @@ from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.maps.global_map import GlobalMap
+from graphslam.refine import surfaces
 from graphslam.refine.nodes import scans_at
 from graphslam.refine.refine import _Refiner, refine_by_scans, refine_if_contradicted
 from graphslam.refine.result import Refinement, ScanCheck
@@ -68,7 +69,8 @@ def test_threads_change_no_byte_of_a_refinement(monkeypatch):
     scans, start, _ = court(SEEDS[0])
     found = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(workers, "cores", lambda n=threads: n)
+        for module in (workers, surfaces):
+            monkeypatch.setattr(module, "cores", lambda n=threads: n)
         made = refine_by_scans(scans, start)
         found.append((made.poses.tobytes(), made.covariances.tobytes(), made.agreement))
     assert found[0] == found[1] == found[2]

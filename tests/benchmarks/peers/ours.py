@@ -130,20 +130,41 @@ def planar(folder: Path, share: float) -> Measured:
 
 
 def on_threads(folder: Path, threads: int) -> Measured:
-    """SegSLAM with 40 particles over 300 s, or the relaxation of a skeleton of 10⁵ poses."""
+    """SegSLAM with 40 particles over 300 s, collapse or relaxation of a skeleton of 10⁵ poses, or a refinement.
+
+    One thread: the process has one core (``bench_peers``), because the refinement uses all of them.
+    """
     import graphslam as gs
+    from graphslam.backend import refining
     from graphslam.skeleton.collapse import Collapse
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
     from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
+    def collapsed(world: Any, pairs: Any) -> Any:
+        collapse = Collapse(int(world.first[-1]))
+        for a, b in pairs:
+            collapse.add(a, b)
+        return collapse.landmarks()[0]
+
     def skeleton(poses: int) -> Any:
         world = draw_laps(LapsConfig(poses=poses))
-        collapse = Collapse(int(world.first[-1]))
-        for a, b in world.correspondences():
-            collapse.add(a, b)
-        return world.problem(collapse.landmarks()[0])
+        return world.problem(collapsed(world, world.correspondences()))
 
-    if json.loads((folder / "case.json").read_text())[0] == "relaxation":
+    case = json.loads((folder / "case.json").read_text())[0]
+    if case == "collapse":
+        world = draw_laps(LapsConfig(poses=100_000))
+        pairs = [(a.copy(), b.copy()) for a, b in world.correspondences()]
+        return lambda: {"landmarks": 1 + int(collapsed(world, pairs).max())}
+    if case == "refinement":
+        from tests.benchmarks.peers import inputs
+
+        inputs.scans(folder, "sim-wheels")
+        log, given, refine = sensor_log(folder), [], refining.refine_by_scans
+        refining.refine_by_scans = lambda *a, **k: given.append(a) or refine(*a, **k)
+        # once with kernels: the scans and the path that the run gives to the refinement
+        gs.run(log, config={"refine": {"use": "always"}, "map": {"fuse": False}}, progress=False)
+        return lambda: {"rounds": len(refine(*given[0]).rounds)}
+    if case == "relaxation":
         config = RelaxConfig(threads=threads)
         relax_skeleton(skeleton(600), config)  # kernels
         problem = skeleton(100_000)
