@@ -147,6 +147,8 @@ class Tutorial:
                 else ""
             )
         data = {kind: "".join(v) if isinstance(v, list) else v for kind, v in output.get("data", {}).items()}
+        if "application/vnd.jupyter.widget-view+json" in data:  # a slider works in a live notebook only
+            return ""
         if "image/png" in data:
             file = f"{self.stem}-{name}.png"
             self.pictures[file] = base64.b64decode(data["image/png"])

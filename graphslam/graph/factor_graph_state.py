@@ -180,6 +180,8 @@ class FactorGraphState:
         self.ledger = Ledger()
         self.events: list[dict[str, Any]] = []
         self.revision = 0
+        self.factor_removed = False
+        """A factor was removed after the values were last optimised: they may still be near *its* optimum."""
         self.submaps: list[SubmapNode] = []
         self._place: dict[int, int] = {}  # submap key -> index in submaps
         self.sensors: dict[str, SensorFactors] = {}
@@ -277,6 +279,7 @@ class FactorGraphState:
         if block is None or not block.kept.any():  # the factors of a block have one ledger entry
             self.ledger.release(factor_id if block is None else block.first_id)
         self.revision += 1
+        self.factor_removed = True
         if isinstance(record, LANDMARK_SUBMAPS):
             for i in set(record.landmark_ids.tolist()):
                 self._seen_in[i].discard(factor_id)

@@ -39,7 +39,7 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import datum_of, level_datum_pose
 from graphslam.graph.gtsam_values import PLACED, from_gtsam, insert_values, placed, value_of
 from graphslam.graph.variables import Values, gtsam_key, split_name, thresholds
-from graphslam.solve.batch import linearisation_gap, optimise_graph, state_of
+from graphslam.solve.batch import best_optimum, linearisation_gap, state_of
 from graphslam.solve.solution import Solution, make_solution
 
 log = logging.getLogger(__name__)
@@ -128,7 +128,7 @@ class Isam2Solver:
         """Solve to the batch optimum reached from here, and relinearise iSAM2 there."""
         self.update()
         t0 = time.perf_counter()
-        optimum = optimise_graph(self.graph)
+        optimum = best_optimum(self.graph)
         self.graph.set_values(optimum.values)
         self._rebuild([], [])
         self.graph.set_values(optimum.values)

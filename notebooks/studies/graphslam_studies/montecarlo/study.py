@@ -127,7 +127,7 @@ class Study:
         ]
         try:
             for title, rows in self.report().items():
-                parts += [html_element("h4", title), html_frame(rows)]
+                parts.append(html_element("details", html_element("summary", title), html_frame(rows)))
         except GraphSlamError as error:
             parts.append(html_element("p", f"no report: {error}"))
         return join_parts(parts)
