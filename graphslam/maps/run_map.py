@@ -65,14 +65,11 @@ class RunMap:
     fused : FusedMap
         Pieces at the solved poses.
     divided : DividedSubmaps
-        The pieces, and their poses along the open chain of exits.
+        The pieces, and their poses along the chain of exits, before the solution.
     bands : mapping of str to (low, high)
         Height bands of the floor plans, one per floor of the path [m]; empty in 2-D.
-    open_entropy, open_volume : float
-        Of the same pieces along the open chain, i.e. the map of the front end only [nat m³, m³].
-    divide_s, fuse_s, move_s : float
-        Seconds to divide the submaps into pieces, to fuse these along the open chain, and to move them to the solved
-        poses.
+    divide_s, fuse_s : float
+        Seconds to divide the submaps into pieces, and to fuse these at the solved poses.
     points : (n, dim) or None
         Of the submaps' clouds at the solved poses [m]; None without clouds.
     passes : Contradictions
@@ -88,11 +85,8 @@ class RunMap:
     fused: FusedMap
     divided: DividedSubmaps
     bands: Mapping[str, tuple[float, float]]
-    open_entropy: float
-    open_volume: float
     divide_s: float
     fuse_s: float
-    move_s: float
     points: Array | None = None
     knows_space: bool = True
     coarsened: int = 1
@@ -119,8 +113,6 @@ class RunMap:
             "pieces": len(f),
             "entropy": f.entropy(),
             "known_volume": f.known_volume(),
-            "entropy_open_chain": self.open_entropy,
-            "known_volume_open_chain": self.open_volume,
             "level_nodes": self.divided.level_nodes,
             "bands": {name: list(band) for name, band in self.bands.items()},
             "bytes": f.nbytes,
@@ -132,13 +124,11 @@ class RunMap:
         """Key, value, unit and better direction of its metrics, for ``metrics.json``."""
         f = self.fused
         unit = "m³" if f.dim == 3 else "m²"
-        seconds = (("divide", self.divide_s), ("fuse", self.fuse_s), ("move", self.move_s))
+        seconds = (("divide", self.divide_s), ("fuse", self.fuse_s))
         contradicted = self.passes.share
         return [
             ("map_entropy", f.entropy(), f"nat {unit}", "lower"),
             ("map_known_volume", f.known_volume(), unit, "none"),
-            ("map_entropy_open_chain", self.open_entropy, f"nat {unit}", "none"),
-            ("map_known_volume_open_chain", self.open_volume, unit, "none"),
             *((("map_contradicted", contradicted, "", "lower"),) if contradicted is not None else ()),
             ("map_pieces", len(f), "", "none"),
             ("map_megabytes", f.nbytes / 1e6, "MB", "lower"),
@@ -172,7 +162,7 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
 def make_run_map(
     submaps: Sequence[Submap], m: GlobalMap, *, reach: float | None = None, config: MapConfig | None = None
 ) -> RunMap:
-    """Fuse the maps of a run's submaps: first along the open chain, then moved to the solved poses.
+    """Fuse the maps of a run's submaps at the solved poses.
 
     Moving objects are removed (:func:`~graphslam.maps.moving.static_submaps`).
 
@@ -212,25 +202,18 @@ def make_run_map(
     model = grid.model if isinstance(grid, EvidenceGrid) else None
     at = solved_poses(divided, nodes)
     divided, coarsened = _held(divided, at)
-    fused = fuse_pieces(divided.pieces, divided.poses, model=model, threads=config.threads)
-    fuse_s = time.perf_counter() - begin
-    open_entropy, open_volume = fused.entropy(), fused.known_volume()
-    begin = time.perf_counter()
-    fused.move(at)
+    fused = fuse_pieces(divided.pieces, at, model=model, threads=config.threads)
     fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
-    move_s = time.perf_counter() - begin
+    fuse_s = time.perf_counter() - begin
     knows_space = all(dense_view(s).knows_space for s in dense)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
     return RunMap(
         fused,
         divided,
         bands,
-        open_entropy,
-        open_volume,
         divide_s,
         fuse_s,
-        move_s,
         points,
         knows_space,
         coarsened,
@@ -240,9 +223,9 @@ def make_run_map(
 
 
 def _held(divided: DividedSubmaps, at: Mapping[PieceId, Array]) -> tuple[DividedSubmaps, int]:
-    """Pieces coarsened until they fit into the largest pool, along the open chain and at ``at``, and the factor."""
+    """Pieces coarsened until they fit into the largest pool at ``at``, and the factor."""
     coarsened, pieces = 1, divided.pieces
-    while max(reach_of(p, T[n]) for T in (divided.poses, at) for n, p in pieces.items()) > half_edge(MAX_LEVELS):
+    while max(reach_of(p, at[n]) for n, p in pieces.items()) > half_edge(MAX_LEVELS):
         coarsened, pieces = 2 * coarsened, {n: coarse_piece(p) for n, p in pieces.items()}
     return dataclasses.replace(divided, pieces=pieces), coarsened
 

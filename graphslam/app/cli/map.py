@@ -99,7 +99,7 @@ def map_command(
         if made.clearest.left_out:
             text += f"\n{made.clearest.left_out} more candidates were not solved"
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
-    value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
+    value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s}
     text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; plots: {', '.join(p.name for p in made.figures)}"
     print_result(value, text, as_json=as_json)
 

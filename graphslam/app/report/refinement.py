@@ -25,8 +25,6 @@ PATHS = ("odometry", "graph", "refined")
 CANDIDATES = (
     ("path error, aligned [m]", "", "path_rmse_aligned_graph", "path_rmse_aligned"),
     ("share of scan points that agree", "refine_agreement_odometry", "refine_agreement_graph", "refine_agreement"),
-    ("entropy of the fused map [nat m³, in the plane nat m²]", "", "map_entropy_graph", "map_entropy"),
-    ("known volume of the fused map [m³, in the plane m²]", "", "map_known_volume_graph", "map_known_volume"),
 )
 """Compared quantities, with the metric of each path."""
 

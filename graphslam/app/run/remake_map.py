@@ -120,7 +120,4 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     config: MapConfig = build_config(MapConfig, merge_options(values.get("map", {}), heights), "map")
     frames = map_of_frames(run.map) if refined else run.map
     made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
-    if refined and {"map_entropy_open_chain", "map_known_volume_open_chain"} <= set(run.metrics["key"]):
-        entropy, volume = (run.metric(f"map_{what}_open_chain") for what in ("entropy", "known_volume"))
-        made = replace(made, open_entropy=entropy, open_volume=volume)  # computed with the front end's end poses
     return replace(run, submaps=submaps, fused=made), made

@@ -213,7 +213,7 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
 
 
 def _refine(made: SolvedMap) -> None:
-    """Refine the path with its scans; the map of the graph is replaced after its fused map was made."""
+    """Refine the path with its scans."""
     clock, settings = time.perf_counter(), made.slam.options.settings
     gps, submaps, graph = made.gps, made.slam.submaps, made.slam.back.graph
     fixes = None
@@ -244,29 +244,21 @@ def _refine(made: SolvedMap) -> None:
 
 
 def _fuse(made: SolvedMap, graph_map: GlobalMap) -> None:
-    """The fused map, along the path of the graph and then along the refined one."""
-    submaps, refined = made.slam.submaps, made.refined
-    made.fuse(submaps, graph_map)
+    """The fused map, along the refined path if there is one."""
+    submaps, refined, frames = made.slam.submaps, made.refined, graph_map
     if refined is not None:
         made.map = refined.map
         made.ledger, spent = refined_ledger(made.ledger, submaps, refined.refinement, made.control_rows)
         made.findings += spent
         refinement_metrics(made.out, refined.refinement)
-        if made.fused is not None and refined.submaps:
-            unit = "m³" if made.fused.fused.dim == 3 else "m²"
-            made.out.add("map_entropy_graph", made.fused.fused.entropy(), f"nat {unit}")
-            made.out.add("map_known_volume_graph", made.fused.fused.known_volume(), unit)
-            # the open chain uses the front end's end poses, which the refinement replaced
-            chain = made.fused.open_entropy, made.fused.open_volume
-            made.fused = None  # free the first map: two maps of a long run would take twice the memory
-            made.fuse(refined.submaps, map_of_frames(refined.map))
-            if made.fused is not None:
-                made.fused = replace(made.fused, open_entropy=chain[0], open_volume=chain[1])
+        if refined.submaps:
+            submaps, frames = refined.submaps, map_of_frames(refined.map)
+    made.fuse(submaps, frames)
     fused = made.fused
     if fused is not None:
         for row in fused.metrics():
             made.out.add(*row)
-        made.seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
+        made.seconds["map"] = fused.divide_s + fused.fuse_s
         made.seconds["total"] += made.seconds["map"]
         removed, every = fused.moving
         if removed:

@@ -98,7 +98,6 @@ def test_nodes_stand_beside_the_body_as_exits_do(finished: Run) -> None:
 def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
     assert finished.metric("path_rmse_aligned") < 0.03
     assert finished.metric("path_rmse_aligned") < 0.3 * finished.metric("path_rmse_aligned_graph")
-    assert finished.metric("map_entropy") < finished.metric("map_entropy_graph")
     assert finished.metric("refine_agreement") > finished.metric("refine_agreement_graph") + 0.1
     assert finished.folder is not None
     for name in ("refined/index.json", "scans.npz", "trajectory_graph.tum", "figures/refined.png"):
@@ -244,8 +243,7 @@ def test_passes_that_deny_each_other_are_given_loops(
 
     options = copy / "config.toml"
     options.write_text(options.read_text().replace("loops = true", 'loops = "auto"'))
-    # each graph has a map before its refinement and one after it
-    said = iter([told(40), told(40), told(contradicted), told(contradicted)])
+    said = iter([told(40), told(contradicted)])  # one map per graph
     monkeypatch.setattr(run_map, "find_contradictions", lambda *_: next(said))
     looked: list[bool] = []
     finish = BackEnd.finish
@@ -271,12 +269,11 @@ def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path)
     read, remade = map_of_folder(copy)
     assert finished.fused is not None
     assert same_map(remade.fused.grid, finished.fused.fused.grid)
-    assert remade.open_entropy == finished.metric("map_entropy_open_chain")
     found = minimum_entropy_loops(read, remade, progress=False)
     rows = found.choice.rows()
     assert len(rows) > 1
     own = [r for r in rows if r["choice"] == "as the run"]
-    assert own[0]["entropy"] == pytest.approx(finished.metric("map_entropy_graph"), rel=1e-3)
+    assert own[0]["entropy"] > finished.metric("map_entropy")  # the path of the graph is less accurate
     assert found.refined is not None  # the chosen one is refined, whichever it is
     assert found.refined_map is not None
     assert found.refined_map.fused.entropy() < rows[0]["entropy"]
