@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
 from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_events, same_loop
 from graphslam.loops.overlap_constraints import overlap_entries
+from graphslam.registration.search import last_value, timed_slices
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 from graphslam_frontends.base import PoseEstimate
@@ -141,6 +142,16 @@ class BackEnd:
 
     def add(self, submap: Submap) -> None:
         """Associate, add and solve; landmarks are merged and loops are searched after every n-th submap."""
+        last_value(self.add_in_slices(submap))
+
+    def add_in_slices(self, submap: Submap) -> Generator[None, None, None]:
+        """:meth:`add`, with the search for loops in slices of bounded work; nothing else may be added in between."""
+        _, spent = yield from timed_slices(self._add(submap))
+        self.per_submap_s.append(spent)
+        for o in self.observers:
+            o.submap_added(submap, self.graph)
+
+    def _add(self, submap: Submap) -> Generator[None, None, None]:
         start = time.perf_counter()
         associated = self.append(submap)
         self.solver.update()
@@ -151,17 +162,15 @@ class BackEnd:
         if self.config.merge_every and n % self.config.merge_every == 0:
             self.merge()
         if self.config.look_every and n % self.config.look_every == 0:
-            self._look()
-        self.per_submap_s.append(time.perf_counter() - start)
-        for o in self.observers:
-            o.submap_added(submap, self.graph)
+            yield from self._look()
 
-    def _look(self) -> None:
+    def _look(self) -> Generator[None, None, None]:
         """During the run: add IMU factors of the submaps so far, and search for loops."""
         if self.imu is not None and self.imu.attach(self.graph, more=True):
             self.solver.update()
         if self.config.looks:
-            self.find_loops(last=False)
+            yield
+            yield from self._find_loops(last=False)
 
     def append(self, submap: Submap) -> float:
         """Associate and add without solving; returns the time after the association (``perf_counter``) [s]."""
@@ -280,12 +289,20 @@ class BackEnd:
         last : bool
             No more submaps follow (:class:`~graphslam.loops.find_loops.LoopSearch`).
         """
-        start = time.perf_counter()
+        return last_value(self._find_loops(last=last))
+
+    def _find_loops(self, *, last: bool) -> Generator[None, None, LoopLedger]:
+        ledger, spent = yield from timed_slices(self._decide_on_loops(last))
+        self.seconds["loops"] = self.seconds.get("loops", 0.0) + spent
+        return ledger
+
+    def _decide_on_loops(self, last: bool) -> Generator[None, None, LoopLedger]:
         for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
             self.graph.remove(fid, reason=DECIDED)
         self.solver.solve_to_optimum()
         self._loops = self._loops or LoopSearch(find_config(self.config))
-        ledger = self._loops.look(self.graph, self.solver, self.submaps, last=last).ledger
+        yield
+        ledger = (yield from self._loops.look_in_slices(self.graph, self.solver, self.submaps, last=last)).ledger
         new = ledger.decisions[self._noted :]
         self._noted = len(ledger.decisions)
         for decision in new:
@@ -294,7 +311,6 @@ class BackEnd:
         for n in dict.fromkeys(d.loop for d in new):
             for o in self.observers:
                 o.loop_decided(ledger.of(n), self.graph)
-        self.seconds["loops"] = self.seconds.get("loops", 0.0) + time.perf_counter() - start
         return ledger
 
     def undo_loop(self, loop: int) -> None:

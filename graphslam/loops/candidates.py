@@ -10,7 +10,7 @@ only one place is registered to a submap.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Generator, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -23,6 +23,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.loops.places import Ints, Places, RelativePoses
+from graphslam.registration.search import last_value
 
 FRONT_END, PROXIMITY, APPEARANCE, OVERLAP = "front-end", "proximity", "appearance", "overlap"
 
@@ -53,7 +54,7 @@ class CandidateConfig:
     """σ of the relative position at which the search takes as long as the registration [m]."""
     least_support: float = 0.05
     """Front-end matches with less support of the particles are not used."""
-    batch: int = 20000
+    batch: int = 2000
     """Number of pairs whose joint marginals are computed at once."""
 
     def __post_init__(self) -> None:
@@ -154,6 +155,19 @@ def proximity_candidates(
     since : int
         Only pairs whose later place is in this submap of the chain or a later one.
     """
+    return last_value(proximity_in_slices(places, relative, config, exclude=exclude, tried=tried, since=since))
+
+
+def proximity_in_slices(
+    places: Places,
+    relative: RelativePoses,
+    config: CandidateConfig | None = None,
+    *,
+    exclude: Collection[tuple[int, int]] = (),
+    tried: Sequence[tuple[int, int]] = (),
+    since: int = 0,
+) -> Generator[None, None, list[LoopCandidate]]:
+    """:func:`proximity_candidates` in slices of bounded work; the graph must not be changed in between."""
     c = CandidateConfig() if config is None else config
     n = len(places)
     first, second = np.triu_indices(n, 1)
@@ -170,6 +184,7 @@ def proximity_candidates(
     kept: list[tuple[Ints, Ints, Array, Array, Array, Array]] = []
     for k in range(0, len(first), c.batch):
         a, b = first[k : k + c.batch].astype(np.int64), second[k : k + c.batch].astype(np.int64)
+        yield
         T, P = relative(places.node[a], places.node[b])
         chance, may = overlap_probability(T, P, c)
         a, b, T, P, chance = a[may], b[may], T[may], P[may], chance[may]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 
 from graphslam.core.errors import ConfigError, DataError
@@ -17,7 +17,7 @@ from graphslam.loops.candidates import (
     LoopCandidate,
     front_end_candidates,
     pairs_sharing_scans,
-    proximity_candidates,
+    proximity_in_slices,
 )
 from graphslam.loops.graph_loops import GraphLoops, GraphSolver, chain_of_graph
 from graphslam.loops.loops import LoopCloser, LoopConfig
@@ -26,6 +26,7 @@ from graphslam.loops.overlap_constraints import Entry, OverlapConfig, overlap_ca
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.place_descriptor import DescriptorConfig, concatenate_descriptors, describe_places
+from graphslam.registration.search import last_value
 
 logger = logging.getLogger(__name__)
 
@@ -125,6 +126,18 @@ class LoopSearch:
         progress: bool = False,
     ) -> LoopCloser:
         """Search for loops; parameters and errors as in :func:`find_loops`; ``last``: no more submaps follow."""
+        return last_value(self.look_in_slices(graph, solver, submaps, last=last, progress=progress))
+
+    def look_in_slices(
+        self,
+        graph: FactorGraph,
+        solver: GraphSolver,
+        submaps: Sequence[Submap],
+        *,
+        last: bool = False,
+        progress: bool = False,
+    ) -> Generator[None, None, LoopCloser]:
+        """:meth:`look` in slices of bounded work; the graph must not be changed in between."""
         c = self.config
         if [s.key for s in submaps] != [s.key for s in graph.submaps]:
             raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))
@@ -140,25 +153,31 @@ class LoopSearch:
         shared = pairs_sharing_scans(submaps) | {(min(a, b), max(a, b)) for a in bare for b in range(len(submaps))}
         since = 0 if last else self._seen
 
-        def go(candidates: Sequence[LoopCandidate]) -> int:
+        def go(candidates: Sequence[LoopCandidate]) -> Generator[None, None, int]:
             before = len(closer.accepted)
-            closer.propose(measurer.measure(candidates, progress=progress))
+            found = yield from measurer.measure_in_slices(candidates, progress=progress)
+            yield
+            yield from closer.propose_in_slices(found, joint=last)
             return len(closer.accepted) - before
 
         if c.front_end:
-            go([x for x in front_end_candidates(submaps, p, c.candidates) if p.submap[x.j] >= self._seen])
+            matches = front_end_candidates(submaps, p, c.candidates)
+            yield from go([x for x in matches if p.submap[x.j] >= self._seen])
         # pairs that failed the registration may be tried again at another place
         tried = [(x.i, x.j) for x in closer.loops.values() if not x.why]
         for _ in range(c.rounds):
-            near = proximity_candidates(p, ours.relative, c.candidates, exclude=shared, tried=tried, since=since)
+            near = yield from proximity_in_slices(
+                p, ours.relative, c.candidates, exclude=shared, tried=tried, since=since
+            )
             tried += [(x.i, x.j) for x in near]
-            if go(near) <= 0:
+            yield
+            if (yield from go(near)) <= 0:
                 break
         self._seen = len(submaps)
         if last:
-            self._look_alike(p, shared, tried, go)
+            yield from go(self._look_alike(p, shared, tried))
             if c.overlaps is not None and c.front_end:
-                go(overlap_candidates(submaps, p, _believed(closer), c.overlaps))
+                yield from go(overlap_candidates(submaps, p, _believed(closer), c.overlaps))
                 _drop_orphans(closer)
             measurer.forget()
         logger.info("loops: %s", closer.ledger.counts() or "no candidates")
@@ -169,12 +188,11 @@ class LoopSearch:
         p: Places,
         shared: set[tuple[int, int]],
         tried: Sequence[tuple[int, int]],
-        go: Callable[[Sequence[LoopCandidate]], int],
-    ) -> None:
+    ) -> list[LoopCandidate]:
         """Candidates by appearance, at any distance."""
         c, measurer = self.config, self._measurer
         if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
-            return
+            return []
         parts = []
         for k, s in enumerate(measurer.submaps):
             # a dense submap without a map raises an error there; landmark submaps have no map
@@ -182,7 +200,7 @@ class LoopSearch:
             parts.append(describe_places(view, p.T_base_node[p.of_submap(k)], c.descriptors))
         seen = {(int(p.submap[i]), round(float(p.arc[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
-        go([x for x in alike if (int(p.submap[x.i]), round(float(p.arc[x.j]), 1)) not in seen])
+        return [x for x in alike if (int(p.submap[x.i]), round(float(p.arc[x.j]), 1)) not in seen]
 
 
 def _believed(closer: LoopCloser) -> set[Entry]:

@@ -22,7 +22,7 @@ solution is needed. Every step writes a :class:`~graphslam.loops.ledger.LoopDeci
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -47,6 +47,7 @@ from graphslam.loops.map_overlap_test import MapCheck, disagreement_shares, over
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 from graphslam.loops.rules import JointTest, LoopConfig, LoopGraph, chi2_without
+from graphslam.registration.search import last_value
 from graphslam.registration.submap_pairs import prediction_chi2
 
 
@@ -84,6 +85,7 @@ class LoopCloser:
         self.joint_test, self.map_check = joint_test, map_check
         self.loops: dict[int, Loop] = {}
         self._torn: list[tuple[list[int], list[int]]] = []
+        self._untested = False  # by the joint test
         self._dof = group_of(increments).dof
 
     # ---------------------------------------------------------------- deciding
@@ -109,7 +111,7 @@ class LoopCloser:
         """Context with additional loops, as far as the graph accepts them; removed at the end, not in the ledger."""
         inside: dict[int, int] = {}
         for _, n in sorted(zip(self._against_chain(list(numbers)), numbers)):
-            verdict, _, facts = self._try(n)
+            verdict, _, facts = last_value(self._try(n))
             if verdict == "accepted":
                 inside[n] = int(facts["factor_id"])
         try:
@@ -127,6 +129,15 @@ class LoopCloser:
         list of LoopDecision
             Current decisions on the new ones, in their order.
         """
+        return last_value(self.propose_in_slices(loops))
+
+    def propose_in_slices(
+        self, loops: Sequence[Loop], *, joint: bool = True
+    ) -> Generator[None, None, list[LoopDecision]]:
+        """:meth:`propose` in slices of a few solutions; the graph must not be changed in between.
+
+        The joint test of all loops, one long call, is left to a later proposal unless ``joint``.
+        """
         first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
         numbers = list(range(first, first + len(loops)))
         usable = []
@@ -137,8 +148,8 @@ class LoopCloser:
             else:
                 check_covariance(loop.covariance, what=f"covariance of loop {n}", dim=self._dof)
                 usable.append(n)
-        if usable:
-            self._decide(usable)
+        if usable or (joint and self._untested):
+            yield from self._decide(usable, joint)
         return [self.ledger.of(n) for n in numbers]
 
     def undo(self, loop: int, why: str = "asked for") -> LoopDecision:
@@ -153,30 +164,32 @@ class LoopCloser:
         self.ledger.write(replace(d, verdict="undone", why=why, weight=0.0, factor_id=-1, effect=effect))
         return self.ledger.of(loop)
 
-    def _decide(self, new: list[int]) -> None:
+    def _decide(self, new: list[int], joint: bool) -> Generator[None, None, None]:
         """Rounds: loops that the graph rejects no longer take part in pairwise consistency."""
         out: set[int] = set()
         self._torn = []  # loops that lost a dispute are decided on again
         while True:
-            refused = self._round(new, out)
-            refused |= self._reconsider()
+            refused = yield from self._round(new, out)
+            refused |= yield from self._reconsider()
             if not refused:
                 break
             out |= refused
-        if self._exchange_by_joint_test():
-            self._reconsider()
+        self._untested = not joint
+        if joint and self._exchange_by_joint_test():
+            yield from self._reconsider()
         seen: list[list[int]] = []
         while self.accepted not in seen:  # removing one group may start a dispute with the next one
             seen.append(self.accepted)
+            yield
             if self._disputes():
-                self._reconsider()
+                yield from self._reconsider()
                 if self.map_check is not None:
                     resolved = {d.loop for d in self.ledger.current() if d.why.startswith(LOST)}
-                    self._round([], resolved)
-                    self._reconsider()
+                    yield from self._round([], resolved)
+                    yield from self._reconsider()
         self._report_weights()
 
-    def _round(self, new: list[int], out: set[int]) -> set[int]:
+    def _round(self, new: list[int], out: set[int]) -> Generator[None, None, set[int]]:
         """One round over all loops except ``out``; returns consistent loops that the graph rejected."""
         # loops that were inconsistent with others may be accepted with more loops
         again = [n for n in self._refused_by_company() if n not in new]
@@ -203,7 +216,7 @@ class LoopCloser:
             else:
                 self._refuse(n, f"pairwise: {found.reasons[k]}", chain[n])
         tried = [n for _, n in sorted(left)]
-        self._one_by_one(tried)
+        yield from self._one_by_one(tried)
         return set(tried) - set(self.accepted)
 
     def _refuse(self, n: int, why: str, chi2: float) -> None:
@@ -212,12 +225,13 @@ class LoopCloser:
         if not last or last[0].why != why:
             self._write(n, "rejected", why, chi2=chi2)
 
-    def _one_by_one(self, numbers: list[int]) -> None:
+    def _one_by_one(self, numbers: list[int]) -> Generator[None, None, None]:
         for n in numbers:  # each with the current graph
-            verdict, why, facts = self._try(n)
+            yield
+            verdict, why, facts = yield from self._try(n)
             self._write(n, verdict, why, **facts)
 
-    def _try(self, n: int) -> tuple[Verdict, str, dict[str, float]]:
+    def _try(self, n: int) -> Generator[None, None, tuple[Verdict, str, dict[str, float]]]:
         """Add one loop if the graph accepts it: decision, reason, values."""
         c, d, loop = self.config, self._dof, self.loops[n]
         limit = chi2_quantile(c.level, d)
@@ -225,9 +239,11 @@ class LoopCloser:
         expected = float(self._against_graph([n])[0])
         if not expected <= limit:  # NaN is not
             return "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", {"chi2": expected}
+        yield
         before = self.graph.chi2()
         fid = self.graph.add_loop(loop, self._kernel())
         self.graph.solve()
+        yield
         after = self.graph.chi2()
         effect = sum(after.values()) - sum(before.values())
         earlier = sum(after[f] - before[f] for f in before)
@@ -259,7 +275,7 @@ class LoopCloser:
         self.graph.solve()
         added = {}
         for _, n in sorted(zip(self._against_chain(outside), outside)):
-            verdict, why, facts = self._try(n)
+            verdict, why, facts = last_value(self._try(n))
             if verdict == "accepted":
                 added[n] = (why, facts)
         if len(added) > len(rivals):
@@ -306,7 +322,7 @@ class LoopCloser:
                 else:
                     self.ledger.write(replace(d, verdict="switched-off", why=why, weight=0.0, factor_id=-1))
             if outcome == "changes":
-                self._one_by_one(b)
+                last_value(self._one_by_one(b))
             elif outcome == "ambiguous":
                 self._torn.append((a, b))
                 for n, value in zip(b, other):
@@ -358,11 +374,12 @@ class LoopCloser:
         """Is a loop consistent with the chain alone?"""
         return self._against_chain([n])[0] <= chi2_quantile(self.config.chain, self._dof)
 
-    def _reconsider(self) -> set[int]:
+    def _reconsider(self) -> Generator[None, None, set[int]]:
         """Switch off loops that the rest of the graph contradicts, worst first; returns their numbers."""
         limit = chi2_quantile(self.config.off, self._dof)
         removed: set[int] = set()
         while inside := self.accepted:
+            yield
             alone = self.without(inside)
             worst = int(np.argmax(alone))
             if not alone[worst] > limit:

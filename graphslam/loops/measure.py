@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,8 @@ from graphslam.evidence.views import dense_view
 from graphslam.loops.candidates import FRONT_END, OVERLAP, LoopCandidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
+from graphslam.registration.search import last_value
+from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair_in_slices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,9 +97,18 @@ class LoopMeasurer:
 
     def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
         """Loops of candidates, in their order; front-end matches and overlap constraints are measured already."""
-        return [self.one(c) for c in Bar(candidates, "matching submaps", shown=progress)]
+        return last_value(self.measure_in_slices(candidates, progress=progress))
 
-    def one(self, c: LoopCandidate) -> Loop:
+    def measure_in_slices(
+        self, candidates: Sequence[LoopCandidate], *, progress: bool = False
+    ) -> Generator[None, None, list[Loop]]:
+        """:meth:`measure` in slices of bounded work."""
+        found = []
+        for c in Bar(candidates, "matching submaps", shown=progress):
+            found.append((yield from self._one(c)))
+        return found
+
+    def _one(self, c: LoopCandidate) -> Generator[None, None, Loop]:
         """The loop of one candidate, whether it passes the gates or not."""
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])
@@ -110,7 +120,8 @@ class LoopMeasurer:
             )  # fmt: skip
         g = group_of(c.T_ij)
         target_prior = g.compose(p.T_base_node[c.i], c.T_ij)
-        m = match_pair(self.prepared(b), p.T_base_node[c.j], self.prepared(a), target_prior, c.covariance)
+        source, target = self.prepared(b), self.prepared(a)
+        m = yield from match_pair_in_slices(source, p.T_base_node[c.j], target, target_prior, c.covariance)
         self._let_go()
         i = c.i
         if m.registration is not None:

@@ -25,7 +25,7 @@ def own_evidence_of(
 ) -> dict[int, EvidenceGrid]:
     """Grids of a chain of submaps without the copies of older maps, by key, in the frames of their bases.
 
-    If the older map was deleted, or moved to another lattice by a merge, :func:`own_evidence` is used.
+    If the older map was deleted, :func:`own_evidence` is used.
 
     Parameters
     ----------
@@ -43,14 +43,12 @@ def own_evidence_of(
         if t.kind[i] == NEW:
             out[s.key] = evidence_grid_of(s)
             continue
-        if not t.alive[source] or not np.array_equal(t.T_map[i], t.T_map[source]):
+        if not t.alive[source]:
             unknown = True
             continue
-        grid, T_map = segmap.map_of(i)
-        found = map_increment(grid, segmap.map_of(source)[0])
-        T_base_map = g.inverse(g.compose(T_map, segment_base(segmap, segmap[i].T_entry)))
-        moved = grid.empty()
-        moved.merge(found.grid, T_base_map)
+        found = map_increment(segmap.map_of(i), segmap.map_of(source))
+        moved = found.grid.empty()
+        moved.merge(found.grid, g.inverse(segment_base(segmap, segmap[i].T_entry)))
         out[s.key] = moved
     if unknown:
         rest, _ = own_evidence(submaps)

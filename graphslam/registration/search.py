@@ -10,6 +10,7 @@ field, which takes a few tenths of a nanosecond per point and start.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -41,6 +42,19 @@ def last_value(work: Generator[None, None, V]) -> V:
         except StopIteration as end:
             value: V = end.value
             return value
+
+
+def timed_slices(work: Generator[None, None, V]) -> Generator[None, None, tuple[V, float]]:
+    """Pass the slices on; returns the result and the wall time of the slices, without the time between them [s]."""
+    seconds = 0.0
+    while True:
+        begin = time.perf_counter()
+        try:
+            next(work)
+        except StopIteration as end:
+            return end.value, seconds + time.perf_counter() - begin
+        seconds += time.perf_counter() - begin
+        yield
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from graphslam.core.points import finite_points
 from graphslam.registration.search_kernels import splat
 
 MOST_CELLS = 200_000_000
+SLICE = 3_000_000
+"""Cells that are written in one slice, some milliseconds."""
 
 
 class SearchField:
@@ -31,6 +34,17 @@ class SearchField:
     """
 
     def __init__(self, points: Any, *, cell: float = 0.2, sigma: float = 0.3) -> None:
+        for _ in self._fill(points, cell, sigma):
+            pass
+
+    @classmethod
+    def in_slices(cls, points: Any, *, cell: float, sigma: float) -> Generator[None, None, SearchField]:
+        """The same field, in slices of bounded work."""
+        field = cls.__new__(cls)
+        yield from field._fill(points, cell, sigma)
+        return field
+
+    def _fill(self, points: Any, cell: float, sigma: float) -> Iterator[None]:
         if not (np.isfinite(cell) and cell > 0 and np.isfinite(sigma) and sigma > 0):
             raise ConfigError(f"search field: cell {cell}, sigma {sigma}; wanted positive numbers of metres")
         p = finite_points(points, what="points of the search field")
@@ -61,8 +75,11 @@ class SearchField:
         values = np.rint(255.0 * np.exp(-0.5 * d2 / sigma**2)).astype(np.uint8)
         nx, ny, nz = size.astype(np.int64)
         self.values: npt.NDArray[np.uint8] = np.zeros((nz, ny, nx), np.uint8)
-        splat(occupied, offsets[near].astype(np.int64), values[near], self.values)
         self._phases: dict[tuple[int, int, int], npt.NDArray[np.uint8]] = {}
+        size_of_slice = max(1, SLICE // int(near.sum()))
+        for k in range(0, len(occupied), size_of_slice):
+            yield
+            splat(occupied[k : k + size_of_slice], offsets[near].astype(np.int64), values[near], self.values)
 
     @property
     def nbytes(self) -> int:

@@ -9,7 +9,7 @@ better than the next one is rejected, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,8 +25,8 @@ from graphslam.core.poses import Group, group_of
 from graphslam.registration.config import LEAST_POINTS
 from graphslam.registration.gates import failed_match_gates, match_margins
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.register import Registration, distinct_registrations, register_starts
-from graphslam.registration.search import correlative_search
+from graphslam.registration.register import Registration, distinct_registrations, register
+from graphslam.registration.search import last_value, search_in_slices
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
@@ -42,6 +42,7 @@ class PreparedMap:
 
     def __init__(self, view: DenseMapView, config: PairConfig) -> None:
         self.view, self.config = view, config
+        self._fields: dict[float, SearchField] = {}
 
     @cached_property
     def points(self) -> Array:
@@ -53,22 +54,21 @@ class PreparedMap:
         """The points with their tree and shapes."""
         return Target(self.points)
 
-    @cached_property
-    def fields(self) -> tuple[SearchField, SearchField]:
-        """Fine and coarse likelihood field."""
-        c = self.config
-        occupied, cell = self.view.points(), c.grid / 4.0
-        return (
-            SearchField(occupied, cell=cell, sigma=c.field_sigma),
-            SearchField(occupied, cell=2.0 * cell, sigma=2.0 * c.field_sigma),
-        )
+    def field_in_slices(self, scale: float) -> Generator[None, None, SearchField]:
+        """Likelihood field, fine (1) or coarse (2), made at first use in slices of bounded work."""
+        if scale not in self._fields:
+            c, occupied = self.config, self.view.points()
+            yield
+            cell = scale * (c.grid / 4.0)
+            self._fields[scale] = yield from SearchField.in_slices(occupied, cell=cell, sigma=scale * c.field_sigma)
+        return self._fields[scale]
 
     @property
     def nbytes(self) -> int:
         """Approximate memory of the computed parts [bytes]."""
         made = self.__dict__
         points = made["points"].nbytes if "points" in made else 0
-        fields = sum(f.nbytes for f in made["fields"]) if "fields" in made else 0
+        fields = sum(f.nbytes for f in self._fields.values())
         return fields + points * (6 if "target" in made else 1)  # the points, their tree and their shapes
 
     def around(self, T_base_place: ArrayLike) -> Array:
@@ -175,6 +175,18 @@ def match_pair(
     PairMatch
         ``T_target_source`` is that of the place. No exception if a match fails.
     """
+    return last_value(match_pair_in_slices(source, T_base_place, target, T_target_place, covariance, config))
+
+
+def match_pair_in_slices(
+    source: PreparedMap,
+    T_base_place: ArrayLike,
+    target: PreparedMap,
+    T_target_place: ArrayLike,
+    covariance: ArrayLike,
+    config: PairConfig | None = None,
+) -> Generator[None, None, PairMatch]:
+    """:func:`match_pair` in slices of bounded work; the result is the same."""
     c = target.config if config is None else config
     g = group_of(T_target_place)
     if g.dim != target.view.dim or g.dim != source.view.dim:
@@ -186,9 +198,12 @@ def match_pair(
         why = f"nothing: {len(points)} points around the place, {len(target.points)} in the map, wanted {LEAST_POINTS}"
         return _nothing(T, why, len(points))
     half = half_widths(T, P, c)
-    fine, coarse = target.fields
+    yield
+    fine = yield from target.field_in_slices(1.0)
+    coarse = yield from target.field_in_slices(2.0)
+    yield
     steps = [*[c.grid] * g.dim, c.yaw_step]
-    found = correlative_search(points, fine, T, half, steps, c.starts, coarse=coarse)
+    found = yield from search_in_slices(points, fine, T, half, steps, c.starts, coarse=coarse)
     best = max((s.score for s in found), default=0.0)
     starts = [s.T for s in found if s.score >= max(c.least_score, best - c.score_margin)]
     if not starts:
@@ -197,7 +212,12 @@ def match_pair(
     rules = replace(c.registration, gates=replace(c.registration.gates, tilt=math.pi))
     cloud = Target(points)
     known = target.view.known_at if target.view.knows_space else None  # without free space, all points must fit
-    results = register_starts(cloud, target.target, starts, rules, known=known)
+    results = []
+    for start in starts:
+        yield
+        results.append(register(cloud, target.target, start, rules, known=known))
+    yield
+    results = distinct_registrations(results)
     results = [_upright_in_known(r, cloud, target, c) for r in results]
     place = np.asarray(T_base_place, dtype=np.float64)
     return replace(_judge(results, points, source, place, target, T, P, c), half_widths=tuple(half))

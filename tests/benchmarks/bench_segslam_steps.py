@@ -3,7 +3,8 @@
 ``python -m tests.benchmarks.bench_segslam_steps [--particles N] [--seconds S] [--world mine]``: all records go to
 `gs.Slam`, which gives a pose after each scan. CPU time of its work between two scans and in the 0.4 s of a step (with
 steps, estimates, ends of submaps and the graph), and of the slices of the filter; by quarters of the path; memory of
-all maps along it. Loops of the back end are searched at the end only. The mine needs `graphslam-studies`.
+all maps along it. Loops of the back end are searched during the drive; ``--look-every 0``: at the end only. The mine
+needs `graphslam-studies`.
 """
 
 from __future__ import annotations
@@ -55,13 +56,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1e9, help="of the log")
     parser.add_argument("--world", default="mine")
     parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--look-every", type=int, default=5, help="submaps between searches for loops")
     parser.add_argument("--quick", action="store_true", help="30 s of a small world")
     a = parser.parse_args()
     if a.quick:
         a.world, a.seconds, a.particles = "court", 30.0, 4
     log = log_of(a.world, a.seed, a.seconds)
     front_end = {"filter": {"particles": a.particles}, "steps": {"level_floors": False}}
-    asked = {"preset": a.world, "frontend": front_end, "backend": {"look_every": 0}}
+    asked = {"preset": a.world, "frontend": front_end, "backend": {"look_every": a.look_every}}
     fed(log_of("court", 1, 20.0), a.seed, {"frontend": front_end})  # compiles
     begin = time.process_time()
     times, work, scans, lags, front, maps = fed(log, a.seed, asked)

@@ -191,8 +191,7 @@ def _known(
         if len(chosen) == config.keep:
             tally.surplus += len(rows) - tried
             break
-        grid, T_map = segmap.map_of(int(places.index[k]))
-        T = g.compose(T_map, T_seg_body[k])
+        grid, T = segmap.map_of(int(places.index[k])), T_seg_body[k]
         half = np.full(g.dim, 0.5 * config.near)
         half[:2] += config.sigmas * places.sigma[nearest[k]]
         half[2:] += config.height + config.rise(places.length[nearest[k]])

@@ -50,6 +50,7 @@ class PoseEstimator:
         """Number of submaps that were output."""
         self._base: tuple[Any, Link] = (None, (0, np.zeros(0), np.zeros(0)))
         self._reckoned: tuple[Any, Link] = self._base
+        self._drifts: dict[int, Array] = {}  # over closed segments
 
     def now(self) -> PoseEstimate:
         """The pose at the last record of the motion."""
@@ -87,23 +88,22 @@ class PoseEstimator:
         for i in chain[n:]:
             s = segmap[i]
             if s.kind == KINDS[MATCH]:
-                link = self._entered(link, s.source, segmap.table.link[i], (s.T_entry, s.match_covariance), known)
+                link = self._entered(link, s.source, (s.T_entry, s.match_covariance), known)
             exit_pose = g.between(segment_base(segmap, s.T_entry), segment_base(segmap, s.T_exit))
             exits, weights = exits_of_interval(segmap, s.interval)
-            D = cast(Drift, drift)(*s.interval, level_end=True)
-            C = exit_covariance(exits, exit_pose, D, weights=weights, drift_scale=self.scale).total
+            if i not in self._drifts:
+                self._drifts[i] = cast(Drift, drift)(*s.interval, level_end=True)
+            C = exit_covariance(exits, exit_pose, self._drifts[i], weights=weights, drift_scale=self.scale).total
             link = link[0], *_compose(g, link[1], link[2], exit_pose, C)
         e = segmap.entries[best]
         if e is not None and e.kind == MATCH:
-            link = self._entered(link, e.source, segmap.links[best], (e.T_entry, e.covariance), known)
+            link = self._entered(link, e.source, (e.T_entry, e.covariance), known)
         return link
 
-    def _entered(
-        self, link: Link, source: int, T_segment_source: Array, entry: tuple[Array, Array | None], known: list[Segment]
-    ) -> Link:
+    def _entered(self, link: Link, source: int, entry: tuple[Array, Array | None], known: list[Segment]) -> Link:
         """The link by the older submap whose map was entered, if that was output."""
         segmap = self.run.segmap
-        found = match_target(segmap, source, T_segment_source, entry[0], known)
+        found = match_target(segmap, source, entry[0], known)
         if found is None or entry[1] is None:
             return link
         anchor = next(k for k, s in enumerate(known) if s.index == found[0].index)

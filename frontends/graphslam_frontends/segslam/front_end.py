@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, cast
 
@@ -12,6 +12,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
+from graphslam.registration.search import last_value
 from graphslam_frontends.base import PoseEstimate, Watch
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import FilterDrift
@@ -24,7 +25,7 @@ from graphslam_frontends.segslam.config import SegSlamConfig
 from graphslam_frontends.segslam.estimate import PoseEstimator
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import SegSlamFilter, run_segslam
-from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_in_slices
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 
@@ -98,7 +99,8 @@ class SegSlam(StepwiseFrontEnd):
             new: list[Submap] = []
             if isinstance(found, SegSlamFilter) and found.closed[0] < 0 and (found.boundary or found.resampled[-1]):
                 yield from _pause(feed)
-                new = _submaps_until(found, found.common(), self.config.drift, self.config.segslam, key)
+                work = _submaps_until(found, found.common(), self.config.drift, self.config.segslam, key)
+                new = yield from _with_records(feed, work)
             elif isinstance(found, SegSlamResult):
                 new = submaps_of_best_particle(found, self.config.drift, self.config.segslam, after=key)
                 new[-1] = with_findings(new[-1], found.steps)
@@ -181,11 +183,22 @@ class SegSlam(StepwiseFrontEnd):
         yield run_segslam(steps, filter, c.segslam, seed.child(0), watch=watch)
 
 
-def _pause(feed: RecordSource) -> Iterator[None]:
+def _pause(feed: RecordSource, seconds: float = 3.0 * PAUSE) -> Iterator[None]:
     """Wait for the records of the next scan: the parts of the work for a submap are not done together."""
     begin = max((feed.until(n) for n in feed.names(object)), default=0.0)
-    while not feed.ended and max(feed.until(n) for n in feed.names(object)) < begin + 3.0 * PAUSE:
+    while not feed.ended and max(feed.until(n) for n in feed.names(object)) < begin + seconds:
         yield None
+
+
+def _with_records(feed: RecordSource, work: Generator[None, None, list[Submap]]) -> Generator[None, None, list[Submap]]:
+    """Do the slices of some work one by one between the records."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            found: list[Submap] = end.value
+            return found
+        yield from _pause(feed, PAUSE)
 
 
 def submaps_of_best_particle(
@@ -200,23 +213,25 @@ def submaps_of_best_particle(
     after : int
         Only the submaps after this key.
     """
-    return _submaps_until(result, int(result.closed[result.best]), drift, config, after)
+    return last_value(_submaps_until(result, int(result.closed[result.best]), drift, config, after))
 
 
 def _submaps_until(
     found: SegSlamFilter | SegSlamResult, last: int, drift: FilterDrift, config: SegSlamConfig, after: int
-) -> list[Submap]:
-    """The submaps after a key of the chain that ends with the segment ``last``; -1: there is none."""
+) -> Generator[None, None, list[Submap]]:
+    """In slices, the submaps after a key of the chain that ends with the segment ``last``; -1: there is none."""
     segmap = found.segmap
     chain = common_ancestor_chain(segmap, last) if last >= 0 else np.zeros(0, dtype=np.int64)
     if len(chain) <= after + 1:
         return []
-    return submaps_of_segments(
-        segmap,
-        chain,
-        drift_by_path(segmap, chain, drift, found.steps),
-        config.handover,
-        uses=found.steps.uses,
-        reasons={b.step: b.why for b in found.boundaries},
-        after=after,
+    return (
+        yield from submaps_in_slices(
+            segmap,
+            chain,
+            drift_by_path(segmap, chain, drift, found.steps),
+            config.handover,
+            uses=found.steps.uses,
+            reasons={b.step: b.why for b in found.boundaries},
+            after=after,
+        )
     )

@@ -306,7 +306,7 @@ class Matcher:
         """Registration target of the map; None if it has too few points."""
 
         def made() -> Target | None:
-            points = self.segmap.map_of(segment)[0].binned_cloud(CLOUD_LEVEL).points
+            points = self.segmap.map_of(segment).binned_cloud(CLOUD_LEVEL).points
             return Target(points) if len(points) >= LEAST_POINTS else None
 
         return self._targets.of(m, made)
@@ -316,13 +316,17 @@ class Matcher:
         s = self.config.search
         known = (self._begin(segment), int(self.segmap.table.end[segment]))
 
-        def made(scale: int) -> SearchField:
-            occupied, cell = self.segmap.map_of(segment)[0].occupied_cloud(), s.grid / 4.0
-            return SearchField(occupied, cell=scale * cell, sigma=scale * s.sigma)
+        def field(scale: int) -> Generator[None, None, SearchField]:
+            found = self._fields.get((*known, scale))
+            if found is None:
+                occupied, cell = self.segmap.map_of(segment).occupied_cloud(), scale * s.grid / 4.0
+                yield
+                found = yield from SearchField.in_slices(occupied, cell=cell, sigma=scale * s.sigma)
+            return self._fields.of((*known, scale), lambda: found)
 
-        fine = self._fields.of((*known, 1), lambda: made(1))
+        fine = yield from field(1)
         yield
-        coarse = self._fields.of((*known, 2), lambda: made(2))
+        coarse = yield from field(2)
         yield
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
         found = yield from search_in_slices(source, fine, T, half, steps, STARTS, coarse=coarse)
@@ -347,7 +351,7 @@ class Matcher:
                 local = None
                 if self.config.choice.method != "registration" and r.accepted:
                     local = localise_in_map(
-                        self.segmap.map_of(segment)[0], r.T_target_source, ahead.window, self.max_range,
+                        self.segmap.map_of(segment), r.T_target_source, ahead.window, self.max_range,
                         seed.child(len(out)).generator(), threads=self.threads,
                     )  # fmt: skip
                 out.append(

@@ -79,7 +79,6 @@ class SampleRoot:
     entry: Array
     exit: Array | None
     source: int
-    link: Array | None
 
 
 def root_of_particle(segmap: SegMap, particle: int, step: int) -> SampleRoot:
@@ -92,7 +91,7 @@ def root_of_particle(segmap: SegMap, particle: int, step: int) -> SampleRoot:
         raise DataError("a sample cannot begin before its segment did", got=step, wanted=f"≥ {start}")
     return SampleRoot(
         segment=OPEN, start=start, end=step, anchor=step, entry=e.T_entry, exit=None,
-        source=-1 if e.kind == NEW else e.source, link=segmap.links[particle],
+        source=-1 if e.kind == NEW else e.source,
     )  # fmt: skip
 
 
@@ -101,7 +100,7 @@ def root_of_segment(segmap: SegMap, index: int) -> SampleRoot:
     s = segmap[index]
     return SampleRoot(
         segment=s.index, start=s.interval[0], end=s.interval[1], anchor=s.interval[1], entry=s.T_entry, exit=s.T_exit,
-        source=s.source, link=segmap.table.link[s.index],
+        source=s.source,
     )  # fmt: skip
 
 
@@ -216,9 +215,9 @@ class _Free:
         self.g, self.t, self.root = segmap.group, segmap.table, root
         self.at = [self.g.identity]
 
-    def linked(self, k: int, T: Array) -> None:
-        """Add a frame at ``T`` relative to frame k."""
-        self.at.append(self.g.compose(self.at[k], T))
+    def shared(self, k: int) -> None:
+        """Add a segment with the frame k."""
+        self.at.append(self.at[k])
 
     def joined(self, k: int, here: int, there: int, direction: int) -> None:
         """Add the frame of segment ``there`` before or after ``here`` (frame k): both have the body pose at the
@@ -228,7 +227,7 @@ class _Free:
             T = frame_between(entry, self.t.exit[there], gravity=False)
         else:
             T = frame_between(cast(Array, exit), self.t.entry[there], gravity=False)
-        self.linked(k, T)
+        self.at.append(self.g.compose(self.at[k], T))
 
     def poses(self) -> Array:
         """``(m, 7)``."""
@@ -242,12 +241,9 @@ class _Upright:
         self.t, self.dim, self.root = segmap.table, segmap.group.dim, root
         self.at = [(0.0, 0.0, 0.0, 0.0)]
 
-    def linked(self, k: int, T: Array) -> None:
-        """As :meth:`_Free.linked`; T is level."""
-        if T.any():
-            self._put(k, T, float(heading_of(T)), np.zeros(3), 0.0)
-        else:
-            self.at.append(self.at[k])
+    def shared(self, k: int) -> None:
+        """As :meth:`_Free.shared`."""
+        self.at.append(self.at[k])
 
     def joined(self, k: int, here: int, there: int, direction: int) -> None:
         """As :meth:`_Free.joined`."""
@@ -338,19 +334,18 @@ class _GrowingSample:
 
     def add_joined(self, k: int) -> list[int]:
         """Add all segments that share a frame with segment k, recursively; returns their indices, k first."""
-        found, g, t, segmap = [k], self.segmap.group, self.t, self.segmap
+        found, t, segmap = [k], self.t, self.segmap
         for k in found:  # the list grows in the loop
             if not self.grows(k):
                 continue
             i, begin = self.segments[k], self.intervals[k][0]
-            source, T, entry = self.root.source, self.root.link, self.root.entry
+            source, entry = self.root.source, self.root.entry
             if k:
-                source, T, entry = int(t.source[i]), t.link[i], t.entry[i]
+                source, entry = int(t.source[i]), t.entry[i]
             if source >= 0 and t.alive[source] and self.free(int(t.start[source]), int(t.end[source])):
-                T = cast(Array, T)
                 # the path continues from the position of the body in the entered map
-                found.append(self.add(source, k, nearest_step(segmap, source, g.compose(g.inverse(T), entry)), begin))
-                self.frames.linked(k, T)
+                found.append(self.add(source, k, nearest_step(segmap, source, entry), begin))
+                self.frames.shared(k)
             entering = segmap.entering(i)
             for begin, end in dict.fromkeys(zip(t.start[entering].tolist(), t.end[entering].tolist())):
                 if not self.free(begin, end):
@@ -359,9 +354,8 @@ class _GrowingSample:
                 chosen = self.draw(rivals[t.end[rivals] == end])
                 if t.source[chosen] != i:
                     continue  # particles of that time did not enter this map
-                T = g.inverse(t.link[chosen])
-                found.append(self.add(chosen, k, begin, nearest_step(segmap, i, g.compose(T, t.entry[chosen]))))
-                self.frames.linked(k, T)
+                found.append(self.add(chosen, k, begin, nearest_step(segmap, i, t.entry[chosen])))
+                self.frames.shared(k)
         return found
 
     def links(self, level: list[int]) -> list[tuple[int, int]]:

@@ -64,10 +64,9 @@ class SegMap:
         self.lift = float(lift) if self.gravity else 0.0
         self.particles = int(particles)
         self.table = SegmentTable(self.group.size)
-        self.maps = SegmentMaps(self.group)
+        self.maps = SegmentMaps()
         # the open segment of each particle: its entry, its first boundary, and the closed segment before it
         self.entries: list[SegmentEntry | None] = [None] * self.particles
-        self.links: list[Array] = [self.group.identity] * self.particles
         self.start: Ints = np.zeros(self.particles, np.int64)
         self.previous: Ints = np.full(self.particles, -1, np.int64)
         self.pruned = 0
@@ -95,7 +94,6 @@ class SegMap:
             weight=float(t.weight[i]),
             match_covariance=t.covariances[i],
             fitness=float(t.fitness[i]),
-            locked=self.maps.locked[t.map[i]],
         )
 
     @property
@@ -120,14 +118,12 @@ class SegMap:
         Returns
         -------
         list of EvidenceGrid or None
-            The map to continue with: a copy of the one entered, locked if that is; None for a new segment, whose map
-            the filter creates.
+            The map to continue with: a copy of the one entered; None for a new segment, whose map the filter creates.
         """
         chosen = self._which(which, len(entries), "entries")
         if not 0 <= step < len(self.times):
             raise DataError("a segment begins outside the path", got=step, wanted=f"0 … {len(self.times) - 1}")
         grids: list[EvidenceGrid | None] = []
-        links = []
         for p, e in zip(chosen, entries):
             if self.entries[p] is not None:
                 raise DataError(f"particle {p} enters a segment before it left its last one", where=f"step {step}")
@@ -136,18 +132,10 @@ class SegMap:
                     f"particle {p} enters a segment elsewhere than where it left the last one",
                     got=step, wanted=int(self.start[p]),
                 )  # fmt: skip
-            links.append(self._check_entry(p, e))
-        for p, e, link in zip(chosen, entries, links):
-            grid = None
-            if e.kind != NEW:
-                m = int(self.table.map[e.source])
-                grid = cast(EvidenceGrid, self.maps.grids[m]).copy()
-                if self.maps.locked[m]:
-                    grid.lock()
-                if e.kind == MATCH:
-                    self.maps.entered[m] += 1
-            grids.append(grid)
-            self.entries[p], self.links[p], self.start[p] = e, link, step
+            self._check_entry(p, e)
+        for p, e in zip(chosen, entries):
+            grids.append(None if e.kind == NEW else self.map_of(e.source).copy())
+            self.entries[p], self.start[p] = e, step
         return grids
 
     def resample(self, ancestors: npt.ArrayLike) -> None:
@@ -156,7 +144,6 @@ class SegMap:
         if a.shape != (self.particles,) or a.min() < 0 or a.max() >= self.particles:
             raise DataError("impossible ancestors", got=a, wanted=f"{self.particles} of 0 … {self.particles - 1}")
         self.entries = [self.entries[i] for i in a]
-        self.links = [self.links[i] for i in a]
         self.start, self.previous = self.start[a], self.previous[a]
 
     def close(
@@ -236,12 +223,11 @@ class SegMap:
             found.append(p)
         return np.array(found[::-1], np.int64)
 
-    def map_of(self, index: int) -> tuple[EvidenceGrid, Array]:
-        """Map of a segment, and ``T_map_segment``: the identity, unless maps were merged. Read-only."""
-        m = int(self.table.map[self._alive(index)])
-        return cast(EvidenceGrid, self.maps.grids[m]), self.table.T_map[index]
+    def map_of(self, index: int) -> EvidenceGrid:
+        """Map of a segment, in its frame. Read-only."""
+        return cast(EvidenceGrid, self.maps.grids[int(self.table.map[self._alive(index)])])
 
-    # --- pruning, locking, merging ---------------------------------------------------------------------------
+    # --- pruning ---------------------------------------------------------------------------------------------
 
     def prune(self) -> int:
         """Drop the segments that are not viable any more, and free their maps; returns their number.
@@ -258,39 +244,11 @@ class SegMap:
         dead = np.flatnonzero(t.alive[: t.count] & ~np.isin(ends, list(here)))
         return self._release(dead)
 
-    def lock(self, index: int) -> None:
-        """Use the map of a segment for localisation only, without updates; also for copies entered later (A12)."""
-        self.maps.lock(int(self.table.map[self._alive(index)]))
-
-    def entered(self, index: int) -> int:
-        """Number of times that particles entered the map of a segment by a match."""
-        return self.maps.entered[int(self.table.map[self._alive(index)])]
-
-    def merge(self, keep: int, other: int, T_keep_other: npt.ArrayLike | None = None) -> EvidenceGrid:
-        """Merge two maps by adding their log-odds (A12); all segments of the two maps then use the merged one.
-
-        Each scan counts once: if one map contains all scans of the other (it was entered and continued), it replaces
-        the other and nothing is added.
-
-        Parameters
-        ----------
-        T_keep_other : (7,) or (3,), optional
-            Between the frames of the segments; default the identity.
-        """
-        i, j = self._alive(keep), self._alive(other)
-        T = self.group.identity if T_keep_other is None else np.asarray(T_keep_other, dtype=np.float64)
-        if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):
-            raise GeometryError("impossible transform between segments", got=T, wanted=f"({self.group.size},) finite")
-        t, g = self.table, self.group
-        T_maps = g.compose(g.compose(t.T_map[i], T), g.inverse(t.T_map[j]))  # T_mapkeep_mapother
-        m = self.maps.merge(t, int(t.map[i]), int(t.map[j]), T_maps)
-        return cast(EvidenceGrid, self.maps.grids[m])
-
     def describe(self) -> dict[str, Any]:
         """Intervals, segments and counts, ready for JSON; the same for the same seed."""
         t = self.table
         return {
-            "segments": [t.row(i, self.times) | {"locked": self.maps.locked[t.map[i]]} for i in self.alive.tolist()],
+            "segments": [t.row(i, self.times) for i in self.alive.tolist()],
             "intervals": self.intervals().tolist(),
             "closed": len(self),
             "pruned": self.pruned,
@@ -304,8 +262,8 @@ class SegMap:
         scans = {interval}
         if e.kind != NEW:  # a copy: it contains the scans of its source, even if that was pruned since
             scans |= self._scans_of(e.source)
-        m = self.maps.add(grid.copy(), frozenset(scans), grid.locked)
-        return self.table.append(interval, e, int(self.previous[p]), path, m, self.links[p], self.group.identity)
+        m = self.maps.add(grid.copy(), frozenset(scans))
+        return self.table.append(interval, e, int(self.previous[p]), path, m)
 
     def _scans_of(self, source: int) -> frozenset[tuple[int, int]]:
         """Intervals with scans in the map of a segment."""
@@ -332,8 +290,8 @@ class SegMap:
             raise DataError(f"{what} do not belong to the particles", got=n, wanted=f"one each of {len(chosen)}")
         return chosen
 
-    def _check_entry(self, p: int, e: SegmentEntry) -> Array:
-        """Raise if an entry is invalid; returns ``T_segment_source`` between the frames."""
+    def _check_entry(self, p: int, e: SegmentEntry) -> None:
+        """Raise if an entry is invalid."""
         T = np.asarray(e.T_entry, dtype=np.float64)
         if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):
             raise GeometryError(f"entry of particle {p} is no pose", got=T, wanted=f"({self.group.size},) finite")
@@ -342,10 +300,9 @@ class SegMap:
                 f"particle {p} enters impossibly", got=f"kind {e.kind}, source {e.source}", wanted="a source, or new"
             )
         if e.kind == NEW:
-            return self.group.identity
+            return
         self._alive(e.source)
         if e.kind == MATCH:  # it may become a factor, which needs a covariance
             if e.covariance is None:
                 raise CovarianceError(f"particle {p} enters segment {e.source} by a match without a covariance")
             check_covariance(e.covariance, what=f"covariance of a match into segment {e.source}", dim=self.group.dof)
-        return np.array(self.table.T_map[e.source])

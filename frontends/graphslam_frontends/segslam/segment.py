@@ -63,8 +63,6 @@ class Segment:
     weight : float
         Sum of the weights of its particles when it was closed.
     match_covariance : (d, d) or None
-    locked : bool
-        Its map is used for localisation only, without updates.
     """
 
     index: int
@@ -81,7 +79,6 @@ class Segment:
     weight: float
     match_covariance: Array | None
     fitness: float
-    locked: bool
 
 
 def check_path(path: Any, entry: SegmentEntry | None, particle: int, interval: tuple[int, int], last: int) -> Array:

@@ -21,6 +21,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
+from graphslam.registration.search import timed_slices
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
@@ -273,16 +274,12 @@ class SegSlamFilter:
         assert entry is not None
         old = int(np.searchsorted(self.steps.times, self.steps.times[k] - KNOWN_GAP, side="right")) - 1
         own = f.ancestry.recent(k - start)[: max(old - start, 0), particle] if old > start else T[None][:0]
-        paths, frames = [own], [T]
-        source, link = (-1 if entry.kind == NEW else entry.source), segmap.links[particle]
-        while source >= 0:  # continue through the older segments of this map, each in its own frame
-            T = self.group.compose(self.group.inverse(link), T)
-            path, link = segmap.table.paths[source], segmap.table.link[source]
-            source = int(segmap.table.source[source])
+        paths, source = [own], -1 if entry.kind == NEW else entry.source
+        while source >= 0:  # continue through the older segments of this map, in the same frame
+            path, source = segmap.table.paths[source], int(segmap.table.source[source])
             if path is not None:
                 paths.append(path)
-                frames.append(T)
-        return any(bool(near_pose(path, at, KNOWN_RADIUS).any()) for path, at in zip(paths, frames))
+        return any(bool(near_pose(path, T, KNOWN_RADIUS).any()) for path in paths)
 
     def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> Generator[None, None, MatchAttempt | None]:
         """Try to enter older maps: at intervals, and whenever a segment ends."""
@@ -291,30 +288,17 @@ class SegSlamFilter:
             return None
         if now - max(s.time for s in self.segmenters) < c.choice.every - 1e-6:
             return None  # the segment would be almost empty
-        begin = time.perf_counter()
         ahead = self._look(k)
-        attempt = None
-        if ahead.full:
-            self.last_attempt = now
-            attempt, begin = yield from self._timed_attempt(k, ahead, begin)
-            if attempt.candidates:
-                self.attempts.append(attempt)
-        self.seconds["match"] += time.perf_counter() - begin
+        if not ahead.full:
+            return None
+        self.last_attempt = now
+        attempt, spent = yield from timed_slices(
+            self.matcher.attempt_in_slices(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
+        )
+        self.seconds["match"] += spent
+        if attempt.candidates:
+            self.attempts.append(attempt)
         return attempt
-
-    def _timed_attempt(
-        self, k: int, ahead: LookAheadScan, begin: float
-    ) -> Generator[None, None, tuple[MatchAttempt, float]]:
-        """An attempt, without the time between its slices, and the time from which on the rest counts [s]."""
-        work = self.matcher.attempt_in_slices(k, self.filter.particles.poses, ahead, self.seed.child("match", k))
-        while True:
-            try:
-                next(work)
-            except StopIteration as end:
-                return end.value, begin
-            self.seconds["match"] += time.perf_counter() - begin
-            yield
-            begin = time.perf_counter()
 
     # --- boundaries ------------------------------------------------------------------------------------------
 

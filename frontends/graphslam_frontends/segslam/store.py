@@ -7,9 +7,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import Group, heading_of
+from graphslam.core.poses import heading_of
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.segslam.segment import KINDS, SegmentEntry
 
@@ -27,7 +26,7 @@ class SegmentTable:
     """
 
     _COLUMNS = ("start", "end", "kind", "source", "previous", "map", "weight", "fitness", "alive", "entry", "exit",
-                "headings", "link", "T_map")  # fmt: skip
+                "headings")  # fmt: skip
 
     def __init__(self, size: int) -> None:
         self.count = 0
@@ -44,8 +43,6 @@ class SegmentTable:
         self.entry: Array = np.zeros((n, size))
         self.exit: Array = np.zeros((n, size))
         self.headings: Array = np.zeros((n, 2))  # at entry and exit [rad]
-        self.link: Array = np.zeros((n, size))  # T_segment_source between the frames, for segments with a source
-        self.T_map: Array = np.zeros((n, size))  # T_map_segment
         self.paths: list[Array | None] = []
         self.covariances: list[Array | None] = []
         self._fitting: tuple[dict[int, Ints], dict[int, Ints], dict[int, Ints]] | None = None
@@ -57,8 +54,6 @@ class SegmentTable:
         previous: int,
         path: Array,
         map: int,
-        link: Array,
-        T_map: Array,
     ) -> int:
         """Append a segment with zero weight; returns its index."""
         i = self.count
@@ -69,7 +64,7 @@ class SegmentTable:
         self.start[i], self.end[i] = interval
         self.kind[i], self.source[i], self.previous[i], self.map[i] = entered.kind, entered.source, previous, map
         self.weight[i], self.fitness[i], self.alive[i] = 0.0, entered.fitness, True
-        self.entry[i], self.exit[i], self.link[i], self.T_map[i] = entered.T_entry, path[-1], link, T_map
+        self.entry[i], self.exit[i] = entered.T_entry, path[-1]
         self.headings[i] = heading_of(np.stack([entered.T_entry, path[-1]]))
         self._fitting = None
         self.paths.append(path)
@@ -122,22 +117,15 @@ def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
 class SegmentMaps:
     """Evidence grids of segments, reference-counted."""
 
-    def __init__(self, group: Group) -> None:
-        self.group = group
+    def __init__(self) -> None:
         self.grids: list[EvidenceGrid | None] = []
         self.users: list[int] = []
-        self.locked: list[bool] = []
-        self.entered: list[int] = []
         self.scans: list[Scans] = []
 
-    def add(self, grid: EvidenceGrid, scans: Scans, locked: bool) -> int:
+    def add(self, grid: EvidenceGrid, scans: Scans) -> int:
         """Add a map with one user; returns its number. The grid is not copied: the caller must not keep it."""
-        if locked:
-            grid.lock()
         self.grids.append(grid)
         self.users.append(1)
-        self.locked.append(locked)
-        self.entered.append(0)
         self.scans.append(scans)
         return len(self.grids) - 1
 
@@ -147,35 +135,3 @@ class SegmentMaps:
         if self.users[m] == 0:
             cast(EvidenceGrid, self.grids[m]).release()
             self.grids[m] = None
-
-    def lock(self, m: int) -> None:
-        """Use the map for localisation only."""
-        cast(EvidenceGrid, self.grids[m]).lock()
-        self.locked[m] = True
-
-    def merge(self, table: SegmentTable, a: int, b: int, T_a_b: Array) -> int:
-        """Merge two maps; all users of one are moved to the other. See `SegMap.merge`."""
-        if a == b:
-            return a
-        if self.scans[a] < self.scans[b]:  # b continued a: its map already contains a
-            return self._move(table, a, b, self.group.inverse(T_a_b))
-        if not self.scans[b] <= self.scans[a]:
-            for s, e in sorted(self.scans[a]):
-                both = sorted((x, y) for x, y in self.scans[b] if x < e and s < y)
-                if both:
-                    raise DataError("the maps share scans, which would count twice", got=f"steps {both[0]}")
-            grid_b = cast(EvidenceGrid, self.grids[b])
-            cast(EvidenceGrid, self.grids[a]).merge(grid_b, T_a_b)
-            self.scans[a] |= self.scans[b]
-        return self._move(table, b, a, T_a_b)
-
-    def _move(self, table: SegmentTable, old: int, to: int, T_to_old: Array) -> int:
-        moved = np.flatnonzero((table.map == old) & table.alive)
-        table.map[moved] = to
-        table.T_map[moved] = self.group.compose(np.broadcast_to(T_to_old, table.T_map[moved].shape), table.T_map[moved])
-        self.users[to] += len(moved)
-        self.entered[to] += self.entered[old]
-        if self.locked[old] and not self.locked[to]:
-            self.lock(to)
-        self.drop(old, len(moved))
-        return to

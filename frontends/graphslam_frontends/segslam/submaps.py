@@ -7,7 +7,7 @@ output as hypotheses with their support, including those of particles outside th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Protocol, cast
 
@@ -20,6 +20,7 @@ from graphslam.core.poses import frame_between, group_of, normalise_weights, pos
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.registration.search import last_value
 from graphslam_frontends.grid.filter_error_model import FilterDrift, interpolate_covariances
 from graphslam_frontends.odometry.growing_steps import GrowingSteps
 from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance, unobserved_covariance, unobserved_stretches
@@ -143,6 +144,25 @@ def submaps_of_segments(
     with_grids : bool
         Include the maps, in the frames of the submaps' bases.
     """
+    return last_value(
+        submaps_in_slices(
+            segmap, chain, drift, config, uses=uses, reasons=reasons, after=after, with_grids=with_grids
+        )
+    )  # fmt: skip
+
+
+def submaps_in_slices(
+    segmap: SegMap,
+    chain: Sequence[int] | Ints,
+    drift: Drift,
+    config: HandoverConfig | None = None,
+    *,
+    uses: frozenset[str] = frozenset(),
+    reasons: Mapping[int, str] | None = None,
+    after: int = -1,
+    with_grids: bool = True,
+) -> Generator[None, None, list[Submap]]:
+    """:func:`submaps_of_segments` in slices of bounded work; the SegMap must not change in between."""
     config = HandoverConfig() if config is None else config
     segments = [segmap[int(i)] for i in chain]
     for a, b in pairwise(segments):
@@ -155,6 +175,7 @@ def submaps_of_segments(
     for s in segments[after + 1 :]:
         matches, considered = _matches(segmap, s, segments, keys)
         considered["holds"] = _holds(segmap, s, segments, keys)
+        yield
         start, end = s.interval
         base = segment_base(segmap, s.T_entry)
         exit_pose = g.between(base, segment_base(segmap, s.T_exit))
@@ -171,7 +192,6 @@ def submaps_of_segments(
             "segments_of_interval": len(exits),
             "effective_segments": round(exit.effective, 3),
             "weight": s.weight,
-            "locked": s.locked,
             "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
             "exit_sigma_matched": np.sqrt(np.diag(exit.matched)).tolist(),
             "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
@@ -179,15 +199,16 @@ def submaps_of_segments(
             **considered,
         }
         poses = g.compose(g.inverse(base), s.path)
+        yield
+        covariances = yield from _path_covariances(segmap, s, poses, drift, config.drift_scale)
+        yield
         out.append(
             Submap(
                 key=keys[s.index],
                 interval=(s.t_start, s.t_end),
                 exit_pose=exit_pose,
                 exit_covariance=exit.matched if config.matched_only else exit.total,
-                trajectory=Trajectory(
-                    segmap.times[start : end + 1], poses, _path_covariances(segmap, s, poses, drift, config.drift_scale)
-                ),
+                trajectory=Trajectory(segmap.times[start : end + 1], poses, covariances),
                 grid=_payload(segmap, s.index, base) if with_grids else None,
                 matches=matches,
                 uses=uses,
@@ -228,8 +249,7 @@ def _shares(weights: Array) -> Array:
 def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
     """The map in the frame of the base; unchanged if it is already in that frame."""
     g = segmap.group
-    grid, T_map = segmap.map_of(index)
-    T_base_map = g.inverse(g.compose(T_map, base))
+    grid, T_base_map = segmap.map_of(index), g.inverse(base)
     if np.abs(g.log(T_base_map)).max() < 1e-9:
         return grid.copy()
     moved = grid.empty()
@@ -237,7 +257,9 @@ def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
     return moved
 
 
-def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, scale: float) -> Array:
+def _path_covariances(
+    segmap: SegMap, s: Segment, poses: Array, drift: Drift, scale: float
+) -> Generator[None, None, Array]:
     """Covariances ``(n, d, d)`` along a path, right tangents: particles at every step, drift interpolated."""
     g, t = segmap.group, segmap.table
     start, end = s.interval
@@ -251,9 +273,13 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
         e = g.log(g.between(poses, g.compose(g.inverse(base), path)))
         P += wk * e[:, :, None] * e[:, None, :]
     knots = np.unique(np.linspace(0, n - 1, min(KNOTS, n)).round().astype(np.int64))
-    D = np.stack([drift(start, start + int(k), level_end=False) for k in knots])
+    D = []
+    for number, k in enumerate(knots):
+        if number % 3 == 0:
+            yield
+        D.append(drift(start, start + int(k), level_end=False))
     along = segmap.path_length[start : end + 1]
-    return P + scale * interpolate_covariances(knots, D, poses, along)
+    return P + scale * interpolate_covariances(knots, np.stack(D), poses, along)
 
 
 def _matches(
@@ -267,7 +293,7 @@ def _matches(
     groups: dict[int, list[tuple[int, Array]]] = {}
     lost = 0
     for i in members[t.kind[members] == MATCH].tolist():
-        found = match_target(segmap, int(t.source[i]), t.link[i], t.entry[i], segments)
+        found = match_target(segmap, int(t.source[i]), t.entry[i], segments)
         if found is None or keys[found[0].index] >= keys[s.index]:
             lost += 1
             continue
@@ -306,7 +332,7 @@ def _holds(segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mappin
 
 
 def match_target(
-    segmap: SegMap, source: int, link: Array, entry: Array, segments: Sequence[Segment]
+    segmap: SegMap, source: int, entry: Array, segments: Sequence[Segment]
 ) -> tuple[Segment, Array] | None:
     """The segment of the chain that a match leads to, and ``T_target_here`` between the bases; None: there is none.
 
@@ -314,16 +340,13 @@ def match_target(
     ----------
     source : int
         The segment whose map was entered.
-    link : (7,) or (3,)
-        ``T_segment_source`` between the frames.
     entry : (7,) or (3,)
         ``T_segment_body`` at the entry.
     """
     g, t = segmap.group, segmap.table
     if not t.alive[source]:
         return None
-    T_source_body = g.compose(g.inverse(link), entry)
-    step = nearest_step(segmap, source, T_source_body)
+    step = nearest_step(segmap, source, entry)
     # the chain may have another particle's segment there: the body pose at that step relates the two
     same = [c for c in segments if c.index == source]
     at = same or [c for c in segments if c.interval[0] <= step <= c.interval[1]]
@@ -334,7 +357,7 @@ def match_target(
     if c.index != source:
         there = cast(Array, t.paths[source])[step - int(t.start[source])]
         T_c_source = frame_between(c.path[step - c.interval[0]], there, gravity=segmap.gravity)
-    here = g.compose(T_c_source, T_source_body)
+    here = g.compose(T_c_source, entry)
     return c, g.between(segment_base(segmap, c.T_entry), segment_base(segmap, here))
 
 

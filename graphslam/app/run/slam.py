@@ -193,7 +193,10 @@ class Slam:
         if not n:
             return found
         at = graph.submaps[-1].exit_node if found.anchor >= n else graph.submaps[found.anchor].node
-        return replace(found, pose=group_of(found.pose).compose(graph.values.poses[at], found.pose))
+        g, T = group_of(found.pose), graph.values.poses[at]
+        for s in self._slam.waiting[: max(found.anchor - n, 0)]:
+            T = g.compose(T, s.exit_pose)
+        return replace(found, pose=g.compose(T, found.pose))
 
     @property
     def submaps(self) -> Sequence[Submap]:

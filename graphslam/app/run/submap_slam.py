@@ -33,6 +33,8 @@ from graphslam.refine.scans import Scans
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
+PAUSE = 0.16
+"""Time of the log between two slices of the search for loops [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +94,10 @@ class SubmapSlam:
         self.submaps: list[Submap] = [] if self.store is None else self.store.complete_prefix()
         if self.store is not None and self.options.front is not None:
             self.store.truncate(len(self.submaps))
+        self.waiting: list[Submap] = []
+        """Finished submaps that are not yet in the graph, because it is searched for loops."""
+        self._adding: Iterator[None] | None = None
+        self._paused = -np.inf
         self._resumed = len(self.submaps)
         for s in self.submaps:
             self.back.add(s)
@@ -126,16 +132,31 @@ class SubmapSlam:
             spent = time.perf_counter() - start
             self._seconds, self._since = self._seconds + spent, self._since + spent
             if submap is None:  # needs more records, or the log has ended
+                self._add()
                 return
             if isinstance(submap.grid, EvidenceGrid):
                 submap.grid.pool.release_scratch()
                 submap = replace(submap, grid=spill_grid(submap.grid))
             if self.store is not None:
                 self.store.append(submap)
-            self.back.add(submap)
-            self.submaps.append(submap)
             self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
             self._since = 0.0
+            self.waiting.append(submap)
+            self._add()
+
+    def _add(self) -> None:
+        """Add the waiting submaps to the graph; while records come, one slice in :data:`PAUSE`."""
+        while self.waiting or self._adding is not None:
+            if not self.feed.ended:
+                latest = max(map(self.feed.until, self.feed.names(object)))
+                if latest < self._paused + PAUSE:
+                    return
+                self._paused = latest
+            if self._adding is None:
+                self.submaps.append(self.waiting.pop(0))
+                self._adding = self.back.add_in_slices(self.submaps[-1])
+            if next(self._adding, self) is self:
+                self._adding = None
 
     def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
         """Last factors, loops, and the optimum; without the loops in ``undo``."""

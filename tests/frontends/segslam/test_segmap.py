@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graphslam.core.errors import CovarianceError, DataError, GeometryError, GridLockedError
+from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, SegMap, SegmentEntry
@@ -40,18 +40,17 @@ def test_a_particle_goes_out_and_comes_back_into_its_first_map() -> None:
     assert marked(again) == {(0, 0)}
     mark(again, 1, 1)
     m.close(6, [again], [straight(np.array([0.5, 0.0, np.pi]), 2.0, 2)], [1.0])
-    assert marked(m.map_of(0)[0]) == {(0, 0)}  # what was entered is as it was
-    assert marked(m.map_of(2)[0]) == {(0, 0), (1, 1)}
+    assert marked(m.map_of(0)) == {(0, 0)}  # what was entered is as it was
+    assert marked(m.map_of(2)) == {(0, 0), (1, 1)}
     s = m[2]
     assert (s.kind, s.source, s.previous, s.interval) == ("match", 0, 1, (4, 6))
     assert (s.t_start, s.t_end, s.length, s.weight, s.fitness) == (4.0, 6.0, 2.0, 1.0, 0.9)
     np.testing.assert_allclose(s.T_exit, [-1.5, 0.0, np.pi], atol=1e-12)
     assert m.chain(2).tolist() == [0, 1, 2]
     assert m.intervals().tolist() == [[0, 2], [2, 4], [4, 6]]
-    assert m.entered(0) == 1
-    assert m.entered(1) == 0
-    m.open(6, [SegmentEntry(T_entry=m[2].T_exit, kind=SAME, source=2)])  # going on is not entering
-    assert m.entered(2) == 0
+    (same,) = m.open(6, [SegmentEntry(T_entry=m[2].T_exit, kind=SAME, source=2)])
+    assert same is not None
+    assert marked(same) == {(0, 0), (1, 1)}
 
 
 def test_all_that_end_at_a_boundary_fit_all_that_begin_there() -> None:
@@ -116,101 +115,13 @@ def test_a_dead_end_of_two_segments_goes_at_once() -> None:
     assert m.alive.tolist() == [0]
 
 
-def test_a_locked_map_is_entered_as_a_locked_copy() -> None:
-    m = small_segmap(5, 1)
-    m.open(0, [_new()])
-    m.close(2, [flat_grid()], [straight(ZERO, 1.0, 2)])
-    m.lock(0)
-    assert m[0].locked
-    (grid,) = m.open(2, [match_entry(ZERO, 0)])
-    assert grid is not None
-    with pytest.raises(GridLockedError):
-        mark(grid, 0, 0)
-    m.close(4, [grid], [straight(ZERO, 1.0, 2)])
-    assert m[1].locked
-
-
-def _pair(gap: bool = True) -> tuple[SegMap, list[EvidenceGrid]]:
-    """Two segments that saw different scans: voxel (0, 0), and voxel (5, 5) of a frame 3 m farther along x."""
+def _pair() -> SegMap:
+    """Two segments, one after the other."""
     m = small_segmap(9, 1)
-    m.open(0, [_new()])
-    a, b = flat_grid(), flat_grid()
-    mark(a, 0, 0)
-    m.close(2, [a], [straight(ZERO, 3.0, 2)])
-    m.open(2, [_new()])
-    mark(b, 5, 5)
-    m.close(4, [b], [straight(ZERO, 1.0, 2)])
-    return m, [a, b]
-
-
-def test_merged_maps_add_their_log_odds_and_serve_both_segments() -> None:
-    m, _ = _pair()
-    mark(m.map_of(1)[0], 2, 2)
-    merged = m.merge(0, 1, np.array([3.0, 0.0, 0.0]))
-    assert marked(merged) == {(0, 0), (8, 5), (5, 2)}
-    grid, T = m.map_of(1)
-    assert grid is merged is m.map_of(0)[0]
-    np.testing.assert_allclose(T, [3.0, 0.0, 0.0])
-    np.testing.assert_allclose(m.map_of(0)[1], 0.0)
-    # who enters segment 1 now works in the frame of segment 0, and the link says so
-    (copy,) = m.open(4, [match_entry(np.array([4.0, 0.0, 0.0]), 1)])
-    assert copy is not None
-    assert marked(copy) == marked(merged)
-    m.close(6, [copy], [straight(np.array([4.0, 0.0, 0.0]), 1.0, 2)])
-    np.testing.assert_allclose(m.table.link[2], [3.0, 0.0, 0.0])
-    # twice the same evidence: merging again changes nothing
-    before = merged.brick_values()
-    assert m.merge(1, 0) is merged
-    np.testing.assert_array_equal(merged.brick_values(), before)
-
-
-def test_merging_counts_no_scan_twice() -> None:
-    m, _ = _pair()
-    (grid,) = m.open(4, [match_entry(ZERO, 0)])
-    assert grid is not None
-    mark(grid, 7, 7)
-    m.close(6, [grid], [straight(ZERO, 1.0, 2)])
-    odds = m.map_of(0)[0].log_odds_at([[0.5, 0.5]])
-    merged = m.merge(0, 2)  # 2 went on from 0, so that it holds 0's scans already
-    assert merged.log_odds_at([[0.5, 0.5]]) == odds
-    assert marked(merged) == {(0, 0), (7, 7)}
-    (grid,) = m.open(6, [match_entry(ZERO, 0)])
-    assert grid is not None
-    m.close(8, [grid], [straight(ZERO, 1.0, 2)])
-    assert m.merge(0, 1) is not None  # 0 … 2, 4 … 6 and 2 … 4: no scan in both
-    with pytest.raises(DataError, match="share scans"):
-        m.merge(0, 3)
-
-
-def test_maps_of_overlapping_intervals_are_refused_and_of_others_not() -> None:
-    def pair(first: tuple[int, int], second: tuple[int, int]) -> SegMap:
-        m = small_segmap(9, 2)
-        for p, (a, b) in enumerate((first, second)):
-            m.open(a, [_new()], which=[p])
-            m.close(b, [flat_grid()], [straight(ZERO, 1.0, b - a)], which=[p])
-        return m
-
-    for first, second in (((0, 2), (3, 5)), ((3, 5), (0, 2)), ((0, 2), (2, 4)), ((2, 4), (0, 2)), ((0, 3), (0, 3))):
-        pair(first, second).merge(0, 1)
-    for first, second in (((0, 3), (0, 2)), ((0, 2), (0, 3)), ((0, 3), (2, 5)), ((2, 5), (0, 3)), ((1, 2), (0, 5))):
-        with pytest.raises(DataError, match="share scans"):
-            pair(first, second).merge(0, 1)
-
-
-def test_the_map_goes_with_its_last_user() -> None:
-    pool = GridPool(levels=3)
-    m = small_segmap(9, 1)
-    for k in range(2):
-        m.open(2 * k, [_new()])
-        grid = flat_grid(pool)
-        mark(grid, 40 * k, 0)
-        m.close(2 * k + 2, [grid], [straight(ZERO, 1.0, 2)])
-        del grid
-    m.merge(0, 1)
-    m._release(np.array([0]))
-    assert pool.used_bricks == 2  # segment 1 has both
-    m._release(np.array([1]))
-    assert pool.used_bricks == 0
+    for a, b in ((0, 2), (2, 4)):
+        m.open(a, [_new()])
+        m.close(b, [flat_grid()], [straight(ZERO, 1.0, 2)])
+    return m
 
 
 def test_impossible_entries_and_exits_are_refused() -> None:
@@ -258,7 +169,7 @@ def test_impossible_entries_and_exits_are_refused() -> None:
 
 def test_a_description_is_json_and_the_same_for_the_same_history() -> None:
     def text() -> str:
-        m, _ = _pair()
+        m = _pair()
         m.open(4, [match_entry(ZERO, 0)])
         m.close(5, [flat_grid()], [straight(ZERO, 1.0, 1)])
         return json.dumps(m.describe(), allow_nan=False)
@@ -335,7 +246,7 @@ def test_any_history_gives_what_the_plain_twin_has(ops: list[tuple], seed: int) 
         assert (s.interval, s.source, s.previous) == ((t["start"], t["end"]), t["source"], t["previous"])
         assert s.weight == pytest.approx(t["weight"])
         np.testing.assert_array_equal(s.path, np.stack(t["path"]))
-        assert marked(m.map_of(i)[0]) == t["scans"]
+        assert marked(m.map_of(i)) == t["scans"]
         assert m.ending_at(s.interval[0]).tolist() == [j for j in m.alive.tolist() if twin.compatible(j, i)]
     # whoever kept a map gives it back: nothing of the pool is left in use
     assert (pool.used_bricks > 0) == (now > 0)

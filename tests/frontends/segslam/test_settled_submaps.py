@@ -164,17 +164,15 @@ def test_maps_are_handed_over_in_the_frames_of_their_bases() -> None:
     mark(grid, 5, 2)
     m.close(2, [grid], [straight(ZERO, 1.0, 2)])
     m.open(2, [match_entry(entry, 0)])
-    m.close(4, [m.map_of(0)[0].copy()], [straight(entry, 1.0, 2)])
+    m.close(4, [m.map_of(0).copy()], [straight(entry, 1.0, 2)])
     first, second = submaps_of_segments(m, [0, 1], drift)
     assert isinstance(first.grid, EvidenceGrid)
     assert isinstance(second.grid, EvidenceGrid)
-    assert first.grid.same_as(m.map_of(0)[0])
+    assert first.grid.same_as(m.map_of(0))
     assert marked(first.grid) == {(5, 2)}
     # voxel (5, 2) has its centre at (5.5, 2.5): 0.5 m ahead and 2.5 m to the right of a body at (3, 2) facing left
     assert marked(second.grid) == {(0, -3)}
     assert submaps_of_segments(m, [0], drift, with_grids=False)[0].grid is None
-    m.merge(1, 0)
-    assert marked(submaps_of_segments(m, [0], drift)[0].grid) == {(5, 2)}  # type: ignore[arg-type]
 
 
 def test_a_chain_with_gaps_is_refused_and_holes_in_a_history_are_filled() -> None:

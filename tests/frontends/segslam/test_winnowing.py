@@ -165,15 +165,6 @@ def test_levels_above_each_other_are_distinguished() -> None:
         )
 
 
-def test_merged_maps_are_asked_in_their_own_frame() -> None:
-    m, step = block(), int(4 * SIDE) + 5
-    m.merge(1, 0, np.array([-SIDE, 0.0, -np.pi / 2]))
-    c = SegmentCandidateConfig(gap=25.0, sigma_per_metre=0.001)
-    found = winnow(m, _sample(m, step), np.array([5.0, 0.0, 0.0]), step, c)
-    assert found.segments.tolist() == [0]
-    np.testing.assert_allclose(found.T_map_body[0], [-SIDE, -5.0, -np.pi / 2], atol=1e-9)
-
-
 def test_a_closed_root_is_no_candidate_of_itself() -> None:
     m = block()
     s = grow_sample(m, root_of_segment(m, 0), np.random.default_rng(0))

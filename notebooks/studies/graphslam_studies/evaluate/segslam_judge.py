@@ -182,7 +182,7 @@ def _place(segmap: SegMap, i: int) -> tuple[int, Array]:
     best: tuple[float, int, Array] | None = None
     begin = (0, T)
     while t.source[k] >= 0:
-        T, k = g.compose(g.inverse(t.link[k]), T), int(t.source[k])
+        k = int(t.source[k])
         begin = (int(t.start[k]), g.between(t.entry[k], T))
         path = t.paths[k]
         if path is None:  # pruned

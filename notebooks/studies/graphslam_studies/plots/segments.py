@@ -107,7 +107,7 @@ def sample_paths(
     labels : list of str
         Number in time, with "m" where an older map was entered.
     """
-    g, t = segmap.group, segmap.table
+    g = segmap.group
     if frame not in ("root", "first"):
         raise ConfigError(f"frame {frame!r} of a map sample; known: root, first")
     poses = sample.poses
@@ -128,9 +128,8 @@ def sample_paths(
         if s.kind != KINDS[MATCH] or s.source not in place:
             continue
         source = segmap[s.source]
-        seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
         at = poses[place[s.source]]
-        nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
+        nearest = source.path[nearest_step(segmap, s.source, s.T_entry) - source.interval[0]]
         matches.append(DrawnMatch(paths[-1][0], placed_segments(at, nearest[None])[0]))
     return paths, matches, labels
 
