@@ -84,6 +84,7 @@ def use_palette() -> None:
     import matplotlib.pyplot as plt
 
     plt.rcParams["axes.prop_cycle"] = plt.cycler(color=CYCLE)
+    plt.rcParams["axes.formatter.min_exponent"] = 3  # 0.2 in place of 2 × 10⁻¹: labels of log axes do not overlap
 
 
 def colour(k: int) -> str:
