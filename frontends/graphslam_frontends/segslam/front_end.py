@@ -169,6 +169,7 @@ class SegSlam(StepwiseFrontEnd):
             if watch is not None:
                 watch(run.progress(number))
             yield run
+            seen = growing.latest  # more records came if submaps were made meanwhile: the filter goes on one by one
         while not feed.ended:
             yield None
         steps = self.steps(feed.log, drops=drops)

@@ -19,6 +19,7 @@ from graphslam.app.run.run import Run
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.loops import loops as decisions
+from graphslam.loops.candidates import LoopCandidate
 from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.sim.crawler import simulate_crawler
@@ -56,8 +57,12 @@ def shifted(loops: Sequence[Loop]) -> list[Loop]:
 def disputed(log: SensorLog, folder: Path) -> Run:
     """A run with such loops, of which nothing tells which are right."""
     with pytest.MonkeyPatch.context() as patch:
-        measure = LoopMeasurer.measure
-        patch.setattr(LoopMeasurer, "measure", lambda self, c, **k: shifted(measure(self, c, **k)))
+        measure = LoopMeasurer.measure_in_slices
+
+        def measured(self: LoopMeasurer, candidates: Sequence[LoopCandidate], **k: Any) -> Any:
+            return shifted((yield from measure(self, candidates, **k)))
+
+        patch.setattr(LoopMeasurer, "measure_in_slices", measured)
         patch.setattr(decisions, "choose_group", lambda *_: ("ambiguous", f"{AMBIGUOUS}, two groups: by the test"))
         return run(log, frontend="segslam", seed=2, out=folder, config=OPTIONS, progress=False)
 
