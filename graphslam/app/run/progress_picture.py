@@ -60,8 +60,8 @@ class ProgressPicture(Observer):
         self._log = log
 
     def stage(self, name: str) -> None:
-        """Before the front end: draw the path by the motion sensors, aligned to the GPS fixes, and the fixes."""
-        if name == "front end" and self._log is not None:
+        """Before the calibration: draw the path by the motion sensors, aligned to the GPS fixes, and the fixes."""
+        if name == "calibration" and self._log is not None:
             self._draw(partial(plot_log, self._log))
             self._log = None
 
