@@ -23,7 +23,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.loops.places import Ints, Places, RelativePoses
-from graphslam.registration.search import last_value
+from graphslam.registration.search import at_once
 
 FRONT_END, PROXIMITY, APPEARANCE, OVERLAP = "front-end", "proximity", "appearance", "overlap"
 
@@ -133,7 +133,7 @@ def overlap_probability(T: Array, P: Array, config: CandidateConfig) -> tuple[Ar
     return np.asarray(chance), np.asarray(may)
 
 
-def proximity_candidates(
+def proximity_in_slices(
     places: Places,
     relative: RelativePoses,
     config: CandidateConfig | None = None,
@@ -141,8 +141,11 @@ def proximity_candidates(
     exclude: Collection[tuple[int, int]] = (),
     tried: Sequence[tuple[int, int]] = (),
     since: int = 0,
-) -> list[LoopCandidate]:
+) -> Generator[None, None, list[LoopCandidate]]:
     """Pairs of places that may observe the same surroundings by the graph's estimate, best first.
+
+    In slices of bounded work; the graph must not be changed in between. :data:`proximity_candidates` does them in one
+    call.
 
     Parameters
     ----------
@@ -155,19 +158,6 @@ def proximity_candidates(
     since : int
         Only pairs whose later place is in this submap of the chain or a later one.
     """
-    return last_value(proximity_in_slices(places, relative, config, exclude=exclude, tried=tried, since=since))
-
-
-def proximity_in_slices(
-    places: Places,
-    relative: RelativePoses,
-    config: CandidateConfig | None = None,
-    *,
-    exclude: Collection[tuple[int, int]] = (),
-    tried: Sequence[tuple[int, int]] = (),
-    since: int = 0,
-) -> Generator[None, None, list[LoopCandidate]]:
-    """:func:`proximity_candidates` in slices of bounded work; the graph must not be changed in between."""
     c = CandidateConfig() if config is None else config
     n = len(places)
     first, second = np.triu_indices(n, 1)
@@ -211,6 +201,9 @@ def proximity_in_slices(
         )
         for k in chosen
     ]
+
+
+proximity_candidates = at_once(proximity_in_slices)
 
 
 def thin_candidates(

@@ -11,9 +11,10 @@ field, which takes a few tenths of a nanosecond per point and start.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,7 @@ SLICE_MODES = 16
 """Modes that are refined in one slice."""
 
 V = TypeVar("V")
+P = ParamSpec("P")
 
 
 def last_value(work: Generator[None, None, V]) -> V:
@@ -42,6 +44,16 @@ def last_value(work: Generator[None, None, V]) -> V:
         except StopIteration as end:
             value: V = end.value
             return value
+
+
+def at_once(work: Callable[P, Generator[None, None, V]]) -> Callable[P, V]:
+    """The function that does all slices of ``work`` in one call."""
+
+    @wraps(work)
+    def whole(*args: P.args, **kwargs: P.kwargs) -> V:
+        return last_value(work(*args, **kwargs))
+
+    return whole
 
 
 def timed_slices(work: Generator[None, None, V]) -> Generator[None, None, tuple[V, float]]:

@@ -26,7 +26,7 @@ from graphslam.registration.config import LEAST_POINTS
 from graphslam.registration.gates import failed_match_gates, match_margins
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.register import Registration, distinct_registrations, register
-from graphslam.registration.search import last_value, search_in_slices
+from graphslam.registration.search import at_once, search_in_slices
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
@@ -149,15 +149,17 @@ class PairMatch:
         }
 
 
-def match_pair(
+def match_pair_in_slices(
     source: PreparedMap,
     T_base_place: ArrayLike,
     target: PreparedMap,
     T_target_place: ArrayLike,
     covariance: ArrayLike,
     config: PairConfig | None = None,
-) -> PairMatch:
+) -> Generator[None, None, PairMatch]:
     """Match the surroundings of a place of one submap to another submap.
+
+    In slices of bounded work; :data:`match_pair` does them in one call.
 
     Parameters
     ----------
@@ -175,18 +177,6 @@ def match_pair(
     PairMatch
         ``T_target_source`` is that of the place. No exception if a match fails.
     """
-    return last_value(match_pair_in_slices(source, T_base_place, target, T_target_place, covariance, config))
-
-
-def match_pair_in_slices(
-    source: PreparedMap,
-    T_base_place: ArrayLike,
-    target: PreparedMap,
-    T_target_place: ArrayLike,
-    covariance: ArrayLike,
-    config: PairConfig | None = None,
-) -> Generator[None, None, PairMatch]:
-    """:func:`match_pair` in slices of bounded work; the result is the same."""
     c = target.config if config is None else config
     g = group_of(T_target_place)
     if g.dim != target.view.dim or g.dim != source.view.dim:
@@ -221,6 +211,9 @@ def match_pair_in_slices(
     results = [_upright_in_known(r, cloud, target, c) for r in results]
     place = np.asarray(T_base_place, dtype=np.float64)
     return replace(_judge(results, points, source, place, target, T, P, c), half_widths=tuple(half))
+
+
+match_pair = at_once(match_pair_in_slices)
 
 
 def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:

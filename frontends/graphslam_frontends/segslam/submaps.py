@@ -20,7 +20,7 @@ from graphslam.core.poses import frame_between, group_of, normalise_weights, pos
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.registration.search import last_value
+from graphslam.registration.search import at_once
 from graphslam_frontends.grid.filter_error_model import FilterDrift, interpolate_covariances
 from graphslam_frontends.odometry.growing_steps import GrowingSteps
 from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance, unobserved_covariance, unobserved_stretches
@@ -118,7 +118,7 @@ def sampled_chain(segmap: SegMap, sample: MapSample) -> Ints:
     return np.asarray(sample.segments[np.argsort(segmap.table.start[sample.segments])], np.int64)
 
 
-def submaps_of_segments(
+def submaps_in_slices(
     segmap: SegMap,
     chain: Sequence[int] | Ints,
     drift: Drift,
@@ -128,8 +128,10 @@ def submaps_of_segments(
     reasons: Mapping[int, str] | None = None,
     after: int = -1,
     with_grids: bool = True,
-) -> list[Submap]:
+) -> Generator[None, None, list[Submap]]:
     """Submaps of a chain of segments.
+
+    In slices of bounded work; the SegMap must not change in between. :data:`submaps_of_segments` does them in one call.
 
     Parameters
     ----------
@@ -144,25 +146,6 @@ def submaps_of_segments(
     with_grids : bool
         Include the maps, in the frames of the submaps' bases.
     """
-    return last_value(
-        submaps_in_slices(
-            segmap, chain, drift, config, uses=uses, reasons=reasons, after=after, with_grids=with_grids
-        )
-    )  # fmt: skip
-
-
-def submaps_in_slices(
-    segmap: SegMap,
-    chain: Sequence[int] | Ints,
-    drift: Drift,
-    config: HandoverConfig | None = None,
-    *,
-    uses: frozenset[str] = frozenset(),
-    reasons: Mapping[int, str] | None = None,
-    after: int = -1,
-    with_grids: bool = True,
-) -> Generator[None, None, list[Submap]]:
-    """:func:`submaps_of_segments` in slices of bounded work; the SegMap must not change in between."""
     config = HandoverConfig() if config is None else config
     segments = [segmap[int(i)] for i in chain]
     for a, b in pairwise(segments):
@@ -216,6 +199,9 @@ def submaps_in_slices(
             )
         )
     return out
+
+
+submaps_of_segments = at_once(submaps_in_slices)
 
 
 def segment_base(segmap: SegMap, body: Array) -> Array:

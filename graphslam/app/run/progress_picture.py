@@ -13,7 +13,7 @@ import numpy as np
 
 from graphslam.backend.back_end import Observer
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import DataError
+from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.records import Gps
@@ -101,7 +101,11 @@ class ProgressPicture(Observer):
         began = time.monotonic()
         if began < self._next:
             return
-        ax = plot()
+        try:
+            ax = plot()
+        except GraphSlamError as error:  # a picture must not end the run
+            logger.warning("%s was not drawn: %s", self.path, error)
+            return
         if ax is None:
             return
         from graphslam.plots.save import figure_png

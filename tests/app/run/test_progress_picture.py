@@ -12,6 +12,7 @@ import graphslam as gs
 from graphslam.app.run.progress_picture import PICTURE, ProgressPicture, plot_log
 from graphslam.app.run.run_bar import RunBar
 from graphslam.backend.back_end import Observer
+from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
 
@@ -78,3 +79,18 @@ def test_the_odometry_is_aligned_to_the_fixes(log: SensorLog) -> None:
 
 def test_a_log_without_odometry_and_gps_has_no_first_picture(log: SensorLog) -> None:
     assert plot_log(replace(log, streams={"landmarks": log.streams["landmarks"]})) is None
+
+
+def test_a_picture_that_cannot_be_drawn_does_not_end_the_run(
+    log: SensorLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def failing(log: SensorLog) -> None:
+        raise DataError("odometry that cannot be integrated")
+
+    monkeypatch.setattr("graphslam.app.run.progress_picture.plot_log", failing)
+    watch = ProgressPicture(tmp_path)
+    watch.log_read(log)
+    watch.stage("calibration")
+    assert not watch.path.exists()
+    assert "was not drawn" in caplog.text
+    assert "cannot be integrated" in caplog.text
