@@ -38,6 +38,8 @@ from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bo
 from graphslam.join.submap_blocks import fuse_repeated, landmark_map_of
 
 Ints = npt.NDArray[np.int64]
+MAX_HEADING = 0.2
+"""Largest σ of the heading that the shared landmarks give [rad]: beyond it a cycle is not linear in the landmarks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +59,7 @@ class LandmarkLoops:
     shape_chi2, shape_dof : (l,)
         χ² of the shared landmarks after the best relative pose, and its degrees of freedom.
     skipped : int
-        Pairs of submaps whose shared landmarks do not determine a relative pose (they coincide).
+        Pairs of submaps whose shared landmarks do not determine a relative heading (they are too close together).
     left_out : int
         Pairs of submaps that were not used because of ``max_loops``.
     """
@@ -224,7 +226,7 @@ class _Chain:
         L = np.linalg.cholesky(S)
         Mw, rw = np.linalg.solve(L, M), np.linalg.solve(L, r)
         A = Mw.T @ Mw
-        if not np.linalg.cond(A) < 1e12:
+        if not np.linalg.cond(A) < 1e12 or np.linalg.inv(A)[2, 2] > MAX_HEADING**2:
             return None
         G = np.linalg.solve(A, Mw.T) @ np.linalg.inv(L)
         rho = G @ r

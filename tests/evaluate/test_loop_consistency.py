@@ -206,3 +206,6 @@ def test_impossible_questions_are_refused(rng):
     same = replace(lm, positions=np.tile(lm.positions[:1], (len(lm), 1)))  # all landmarks at one point: no heading
     with_same = [chain[0], Submap.from_landmarks(1, same), *chain[2:]]
     assert find_landmark_loops(with_same, X).skipped >= 1
+    close = lm.positions[:1] + rng.normal(0.0, 0.01, lm.positions.shape)  # closer than their σ: still no heading
+    with_close = [chain[0], Submap.from_landmarks(1, replace(lm, positions=close)), *chain[2:]]
+    assert find_landmark_loops(with_close, X).skipped >= 1
