@@ -141,8 +141,9 @@ def path_nees(estimate: Trajectory, reference: Trajectory, *, max_diff: float) -
     if len(i) < 2:
         raise DataError("too few associated poses", got=len(i), wanted="at least 2")
     group = group_of(estimate.poses)
-    T = group.compose(estimate.poses[j[0]], group.inverse(reference.poses[i[0]]))
-    true = group.compose(np.broadcast_to(T, reference.poses[i].shape), reference.poses[i])
+    true = reference.interpolate(np.clip(estimate.times[j], *reference.times[[0, -1]]))
+    T = group.compose(estimate.poses[j[0]], group.inverse(true[0]))
+    true = group.compose(np.broadcast_to(T, true.shape), true)
     found = path_consistency(estimate, Trajectory(estimate.times[j], true), chart="group")
     if not len(found.nees):
         raise DataError("every covariance of the path is singular", wanted="poses that are uncertain")

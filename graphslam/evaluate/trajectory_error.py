@@ -1,7 +1,8 @@
 """Absolute and relative error of a trajectory (Sturm et al. 2012), in two and three dimensions.
 
 ATE: distance between corresponding positions after a given alignment. RPE: error of the motion over a given distance or
-time, ``E_ij = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j)`` with R the reference and P the estimate; it needs no alignment.
+time, ``E_ij = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j)`` with R the reference and P the estimate; it needs no alignment. The reference
+is interpolated at the stamps of the estimate.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class TrajectoryError:
     kind : {"ATE", "RPE"}
     alignment : {"none", "origin", "se", "sim"}
     times : (n,)
-        Stamp of each error in the reference's clock; of the first pose of the pair for RPE.
+        Stamp of each error; of the first pose of the pair for RPE.
     translation : (n,)
         [m].
     rotation : (n,)
@@ -151,16 +152,17 @@ def _pair(
         )
     i, j = match_stamps(reference.times, estimate.times, max_diff=max_diff)
     if not len(i):
+        gap = np.abs(reference.times[_nearest(reference.times, estimate.times)] - estimate.times).min(initial=np.inf)
         raise DataError(
             "no stamps of estimate and reference agree",
-            got=f"{len(estimate)} and {len(reference)} poses",
+            got=f"{len(estimate)} and {len(reference)} poses, the nearest {gap:.3f} s apart",
             wanted=f"stamps within {max_diff} s of each other",
         )
-    ref, est = reference.poses[i], estimate.poses[j].copy()
+    ref, est = reference.interpolate(np.clip(estimate.times[j], *reference.times[[0, -1]])), estimate.poses[j].copy()
     T, scale = fit_alignment(ref, est, alignment)
     est[:, : reference.dim] *= scale
     compose = se2_compose if reference.dim == 2 else se3.se3_compose
-    return reference.times[i], ref, compose(np.broadcast_to(T, est.shape), est), T, scale
+    return estimate.times[j], ref, compose(np.broadcast_to(T, est.shape), est), T, scale
 
 
 def _size(error: Array) -> tuple[Array, Array]:
