@@ -14,7 +14,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.clock import CLOCK_SET_BACK
+from graphslam.io.clock import CLOCK_SET_BACK, MAX_DROPPED
 from graphslam_frontends.odometry.recorded import motion_is_given
 
 STEADY = (Imu, LaserScans, Odometry, PointClouds, RangeScans, SteeringControls, VelocityControls)
@@ -101,18 +101,11 @@ def _order(read: Mapping[str, int], dropped: Mapping[str, int]) -> list[tuple[st
         if reason not in (*ORDER, CLOCK_SET_BACK):
             continue
         share = n / max(read.get(name, n), 1)
+        text = f"records of {name} left out: {n} ({100 * share:.1f} %), {reason}"
         if reason == CLOCK_SET_BACK:
-            text = (
-                f"records of {name} left out: {n} ({100 * share:.1f} %), {reason}, or of a second drive in the same "
-                "recording. Cut the log where the stamps go back, and map the parts one by one."
-            )
+            text += ", or of a second drive in the same recording. Cut the log where the stamps go back; map the parts."
             out.append((name, Finding("bad", "clock-set-back", text)))
-            continue
-        if share <= REORDERED:
-            continue
-        text = (
-            f"records of {name} left out: {n} ({100 * share:.1f} %), {reason} — two drivers write into one stream, or "
-            "the stamps are arrival times. Use the stamps of the measurements."
-        )
-        out.append((name, Finding("bad" if share > 0.01 else "look", "stamps-order", text)))
+        elif share > REORDERED:
+            text += " — recorded twice or late, or from two drivers, or arrival times: use stamps of measurements."
+            out.append((name, Finding("bad" if share > MAX_DROPPED else "look", "stamps-order", text)))
     return out

@@ -154,6 +154,10 @@ def test_headings_in_degrees_and_stamps_out_of_order(tmp_path: Path) -> None:
     t, _, _, pose = small.drive()
     folder = small.tables(tmp_path / "robot", poses=True)
     assert faults(checked(folder)[1]) == {}
+    twice = np.repeat(np.column_stack([t, pose]), np.where(np.arange(len(t)) % 50 == 9, 2, 1), axis=0)
+    np.savetxt(folder / "odometry.csv", twice, delimiter=",", header="t,x,y,theta", comments="")
+    code, lines = checked(folder)
+    assert (code, list(faults(lines))) == (0, ["stamps-order"])  # the copies are dropped
     rows = np.column_stack([t, pose * [1, 1, 180.0 / np.pi]])
     for k in range(20, len(rows), 60):
         rows[[k, k + 1]] = rows[[k + 1, k]]
