@@ -21,7 +21,7 @@ from graphslam.association.compatibility import (
     nearest_neighbour_pairs,
     search_compatible_sets,
 )
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import Submap
 from graphslam.graph.covariance import JointCovariance
@@ -57,12 +57,8 @@ class AssociationConfig:
     max_distance: float = 40.0
 
     def __post_init__(self) -> None:
-        if self.method not in ("joint-compatibility", "nearest-neighbour"):
-            raise ConfigError(
-                f"unknown association method {self.method!r}; known: joint-compatibility, nearest-neighbour"
-            )
-        if not (self.gate > 0 and self.starts >= 1 and 0 < self.joint_probability < 1 and self.covariance_scale > 0):
-            raise ConfigError(f"association parameters out of range: {self}")
+        ranges = {"> 0 or inf": "gate covariance_scale", "≥ 1": "starts", "in (0, 1)": "joint_probability"}
+        check_options(self, "association: ", ranges)
 
 
 @dataclass(frozen=True, slots=True)

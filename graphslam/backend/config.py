@@ -5,10 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-import numpy as np
-
-from graphslam.core.config import flattened_field
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options, flattened_field
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.beacons import BeaconConfig
@@ -30,8 +27,7 @@ class GpsOptions(GpsConfig):
 
     def __post_init__(self) -> None:
         GpsConfig.__post_init__(self)
-        if not (np.isfinite(self.every) and self.every >= 0):
-            raise ConfigError(f"gps.every must not be negative, got {self.every}")
+        check_options(self, "gps.", {"≥ 0": "every"})
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +100,4 @@ class BackEndConfig:
         return self.loops is True
 
     def __post_init__(self) -> None:
-        for name in ("node_spacing", "level_sigma", "match_support", "look_every"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"backend.{name} must not be negative, got {getattr(self, name)}")
+        check_options(self, "backend.", {"≥ 0 or inf": "node_spacing level_sigma match_support look_every"})

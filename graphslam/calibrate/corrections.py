@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
@@ -87,20 +88,15 @@ class Corrections:
     """Intervals of wheel slip, in the clock of the observations [s]: σ of the distance is the whole distance."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, bool) and not np.all(np.isfinite(value)):
-                raise ConfigError(f"calibration: {name} = {value}; wanted a finite number")
-        for name in ("distance_scale", "turn_scale", "range_scale", "range_sigma", "bearing_sigma"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ConfigError(f"calibration: {name} = {value}; wanted > 0")
-        for name in (*NOISE, "along_metre", "range_visit", "bearing_visit"):
-            value = getattr(self, name)
-            if value is not None and value < 0:
-                raise ConfigError(f"calibration: {name} = {value}; wanted ≥ 0")
-        if self.heading_cover is not None and self.heading_cover < 1:
-            raise ConfigError(f"calibration: heading_cover = {self.heading_cover}; wanted ≥ 1")
+        ranges = {
+            "> 0": "distance_scale turn_scale range_scale range_sigma bearing_sigma",
+            "≥ 0": " ".join((*NOISE, "along_metre", "range_visit", "bearing_visit")),
+            "≥ 1": "heading_cover",
+            "finite": "*",
+        }
+        check_options(self, "calibration: ", ranges)
+        if not np.all(np.isfinite(self.slips)):
+            raise ConfigError(f"calibration: slips = {self.slips}; wanted finite numbers")
 
     @property
     def neutral(self) -> bool:
@@ -141,8 +137,7 @@ class CalibrateConfig:
     """Computing effort of the calibration in a run, relative to the default; 1: a few seconds."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.budget <= 100:
-            raise ConfigError(f"calibrate.budget = {self.budget}; wanted above 0, at most 100")
+        check_options(self, "calibrate.", {"in (0, 100]": "budget"})
 
 
 def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:

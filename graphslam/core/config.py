@@ -6,6 +6,7 @@ Defaults are in the code, a file is optional and partial, unknown keys are refus
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import tomllib
 import types
@@ -89,6 +90,54 @@ def convert_option(hint: Any, value: Any, name: str) -> Any:
     if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
         return dict(value)
     raise ConfigError(f"{name} = {value!r}; wanted {getattr(hint, '__name__', hint)}")
+
+
+def check_options(config: Any, prefix: str, ranges: Mapping[str, str]) -> None:
+    """Refuse numbers outside their range, and a value that is not among the choices of a ``Literal``.
+
+    Parameters
+    ----------
+    config : dataclass
+    prefix : str
+        What is before the name of an option in a message, such as ``"gps."``.
+    ranges : mapping of str to str
+        Range → names of the options that must be in it. A range is ``"> 0"``, ``"≥ 1"``, ``"in (0, 1]"`` or
+        ``"finite"``; infinity is only allowed by ``"> 0 or inf"``. The name ``*`` means all numbers that are not
+        named. An optional option may be None.
+    """
+    kind: Any = type(config)
+    hints, named = _type_hints(kind), " ".join(ranges.values()).split()
+    for wanted, names in ranges.items():
+        for name in hints if names == "*" else names.split():
+            value = getattr(config, name)
+            if names == "*" and (name in named or isinstance(value, bool) or not isinstance(value, int | float)):
+                continue
+            if value is None and type(None) in typing.get_args(hints[name]):
+                continue
+            if not _in_range(value, wanted):
+                raise ConfigError(f"{prefix}{name} = {value}; wanted {wanted}")
+    for name, hint in hints.items():
+        value, choices = getattr(config, name), typing.get_args(hint)
+        if typing.get_origin(hint) is Literal and value not in choices:
+            raise ConfigError(f"{prefix}{name} = {value!r}; known: {', '.join(map(str, choices))}")
+
+
+@functools.cache
+def _type_hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+def _in_range(value: float, wanted: str) -> bool:
+    bound = wanted.removesuffix(" or inf")
+    if bound == wanted and not math.isfinite(value):
+        return False
+    if wanted == "finite":
+        return True
+    if bound.startswith("in "):
+        low, high = map(float, bound[4:-1].split(","))
+        above = value >= low if bound[3] == "[" else value > low
+        return above and (value <= high if bound[-1] == "]" else value < high)
+    return value >= float(bound[2:]) if bound[0] == "≥" else value > float(bound[2:])
 
 
 def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.evidence.cast_kernels import HIT, INSIDE, UNKNOWN_SPACE, UNUSABLE
@@ -45,17 +46,12 @@ class EndpointLikelihood:
 
     exponent: float
     floor: float = 0.05
-    interpolation: str = "trilinear"
+    interpolation: Literal["trilinear", "nearest"] = "trilinear"
     unknown: float = 0.5
 
     def __post_init__(self) -> None:
-        _positive("exponent", self.exponent)
-        if not 0.0 < self.floor < 1.0:
-            raise ConfigError(f"end-point likelihood: floor is {self.floor}; wanted inside (0, 1)")
-        if not 0.0 <= self.unknown <= 1.0:
-            raise ConfigError(f"end-point likelihood: unknown is {self.unknown}; wanted 0 … 1")
-        if self.interpolation not in ("nearest", "trilinear"):
-            raise ConfigError(f"interpolation {self.interpolation!r}; wanted 'nearest' or 'trilinear'")
+        ranges = {"> 0": "exponent", "in (0, 1)": "floor", "in [0, 1]": "unknown"}
+        check_options(self, "end-point likelihood: ", ranges)
 
     def beams(self, probability: Any) -> Array:
         """Log-likelihood of each beam; 0 for NaN (points that are not finite)."""
@@ -93,10 +89,9 @@ class CastLikelihood:
     unknown: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("exponent", "sigma", "clip"):
-            _positive(name, getattr(self, name))
+        check_options(self, "cast likelihood: ", {"> 0": "exponent sigma clip"})
         if self.unknown is not None and not 0.0 <= self.unknown <= self.clip:
-            raise ConfigError(f"cast likelihood: unknown is {self.unknown}; wanted 0 … clip ({self.clip})")
+            raise ConfigError(f"cast likelihood: unknown = {self.unknown}; wanted 0 … clip ({self.clip})")
 
     def beams(self, expected: Any, status: Any, measured: Any, max_range: float) -> Array:
         """Log-likelihood of each beam.
@@ -185,8 +180,3 @@ def log_weights(
         threads=threads,
     )
     return likelihood.exponent * likelihood.beams(c.ranges, c.status, measured, limit).sum(axis=1)
-
-
-def _positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise ConfigError(f"likelihood: {name} is {value}; wanted a finite number above 0")

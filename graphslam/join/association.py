@@ -23,7 +23,7 @@ from graphslam.association.compatibility import (
     nearest_neighbour_pairs,
     search_compatible_sets,
 )
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scalars
@@ -65,12 +65,13 @@ class MapAssociationConfig:
     starts: int = 25
 
     def __post_init__(self) -> None:
-        if self.rule not in ("nearest", "joint"):
-            raise ConfigError(f"unknown association rule {self.rule!r}; wanted 'nearest' or 'joint'")
-        if not (self.sensor_range > 0 and self.radius > 0 and self.margin >= 0 and self.starts >= 1):
-            raise ConfigError("association radii must be positive and at least one start is needed")
-        if not 0.0 < self.confidence < 1.0:
-            raise ConfigError(f"association confidence is {self.confidence}; wanted 0 < p < 1")
+        ranges = {
+            "> 0 or inf": "sensor_range radius",
+            "≥ 0 or inf": "margin",
+            "≥ 1": "starts",
+            "in (0, 1)": "confidence",
+        }
+        check_options(self, "association: ", ranges)
 
 
 def match_landmarks(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> Index:

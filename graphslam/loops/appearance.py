@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, level_poses
 from graphslam.loops.candidates import APPEARANCE, LoopCandidate
@@ -39,10 +40,7 @@ class AppearanceConfig:
     """… and of its heading [rad]."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not math.isfinite(value) or value < 0 or (value == 0 and f.name not in ("lead", "least", "least_path")):
-                raise ConfigError(f"loop candidates by appearance: {f.name} = {value}; wanted a positive number")
+        check_options(self, "loop candidates by appearance: ", {"≥ 0": "lead least least_path", "> 0": "*"})
 
 
 def appearance_candidates(

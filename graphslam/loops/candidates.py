@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Generator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
@@ -58,11 +58,7 @@ class CandidateConfig:
     """Number of pairs whose joint marginals are computed at once."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            zero = f.name in ("least_path", "least_gain", "least_support", "stretch")
-            if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-                raise ConfigError(f"loop candidates: {f.name} = {value}; wanted a number {'≥' if zero else '>'} 0")
+        check_options(self, "loop candidates: ", {"≥ 0": "least_path least_gain least_support stretch", "> 0": "*"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,8 @@ import logging
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.evidence.views import has_dense_view
 from graphslam.graph.factor_graph import FactorGraph
@@ -54,8 +55,7 @@ class FindConfig:
     """Largest number of proximity rounds; repeated while loops are accepted, which improve the estimate (0: off)."""
 
     def __post_init__(self) -> None:
-        if self.rounds < 0:
-            raise ConfigError(f"find loops: rounds = {self.rounds}; wanted at least 0")
+        check_options(self, "find loops: ", {"≥ 0": "rounds"})
 
 
 def find_loops(

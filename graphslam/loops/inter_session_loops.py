@@ -10,9 +10,8 @@ the reason.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -20,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.association.consistent_set import LoopArrays, OdometryChain, largest_consistent_set, pair_chi2
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
@@ -69,12 +69,8 @@ class InterSessionConfig:
     """… and minimum share of them that must match, because blocks of houses look alike in part."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not math.isfinite(value) or value < 0 or (f.name in ("top", "keep", "least", "heard") and value < 1):
-                raise ConfigError(f"loop closures of sessions: {f.name} = {value}; wanted a positive number")
-        if not 0 < self.level < 1:
-            raise ConfigError(f"loop closures of sessions: level = {self.level}; wanted a probability in (0, 1)")
+        ranges = {"≥ 1": "top keep least heard", "in (0, 1)": "level", "≥ 0": "*"}
+        check_options(self, "loop closures of sessions: ", ranges)
 
 
 class SessionMap:

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, group_of
 from graphslam.core.submap import Submap
@@ -52,10 +52,7 @@ class OverlapConfig:
     """… and of its angles [rad]."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"overlap constraints: {f.name} = {value}; wanted a number > 0")
+        check_options(self, "overlap constraints: ", {"> 0": "*"})
 
     def covariance(self, group: Group) -> Array:
         """Of an overlap constraint ``(d, d)``, right tangent."""

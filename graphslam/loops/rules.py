@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
@@ -101,6 +101,4 @@ class LoopConfig:
         return RobustKernel("huber", math.sqrt(chi2_quantile(self.kernel, dof)))
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if not 0.0 < getattr(self, f.name) < 1.0:
-                raise ConfigError(f"loops: {f.name} = {getattr(self, f.name)}; wanted a probability in (0, 1)")
+        check_options(self, "loops: ", {"in (0, 1)": "*"})

@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import SE2, SE3
@@ -65,12 +66,8 @@ class DivisionConfig:
     """Places of the path nearer to the previous one are skipped [m]."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.stretch) and self.stretch > 0 and self.reach > 0 and self.spacing >= 0):
-            raise ConfigError(
-                f"division of a map: stretch {self.stretch}, reach {self.reach}, spacing {self.spacing}; wanted > 0"
-            )
-        if not (np.isfinite(self.retrace) and self.retrace >= 0 and np.isfinite(self.spacing)):
-            raise ConfigError(f"division of a map: retrace {self.retrace}, spacing {self.spacing}; wanted ≥ 0 m")
+        ranges = {"> 0": "stretch", "> 0 or inf": "reach", "≥ 0": "spacing retrace"}
+        check_options(self, "division of a map: ", ranges)
 
 
 class _Bricks:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, remove_roll_pitch
@@ -44,8 +45,7 @@ class MapConfig:
     def __post_init__(self) -> None:
         if not self.high > self.low:
             raise ConfigError(f"map: floor plans from {self.low} to {self.high} m; wanted low < high")
-        if self.threads < 1:
-            raise ConfigError(f"map.threads = {self.threads}; wanted ≥ 1")
+        check_options(self, "map.", {"≥ 1": "threads"})
 
 
 REACH_MARGIN = 1.0

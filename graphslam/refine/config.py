@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 
 DISTANCES = (1.0, 0.6, 0.4, 0.3)
 """Largest distance of a pair in each round with all traversals [m]."""
@@ -38,12 +36,4 @@ class RefineConfig:
     """Largest number of points that are matched; more are thinned evenly."""
 
     def __post_init__(self) -> None:
-        if self.use not in (True, False, "always"):
-            raise ConfigError(f"refine: use = {self.use!r}; wanted true, false or always")
-        for name in ("reach", "spacing", "turn"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"refine: {name} = {value}; wanted > 0")
-        for name in ("every", "most_points"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"refine: {name} = {getattr(self, name)}; wanted ≥ 1")
+        check_options(self, "refine: ", {"> 0": "reach spacing turn", "≥ 1": "every most_points"})

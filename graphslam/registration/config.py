@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 
 LEAST_POINTS = 20
 """Least number of points in source and target of a registration, and of pairs."""
-
-
-def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
-    for f in fields(config):
-        value = getattr(config, f.name)
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            low = value >= 0 if f.name in zero else value > 0
-            if not (low and math.isfinite(value)):
-                wanted = "a number ≥ 0" if f.name in zero else "a positive number"
-                raise ConfigError(f"registration: {f.name} is {value}; wanted {wanted}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +48,7 @@ class RegistrationGates:
     tilt: float = math.radians(4.0)
 
     def __post_init__(self) -> None:
-        _check(self, zero=tuple(f.name for f in fields(self)))
+        check_options(self, "registration: ", {"≥ 0": "*"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +84,6 @@ class RegistrationConfig:
     gates: RegistrationGates = field(default_factory=RegistrationGates)
 
     def __post_init__(self) -> None:
-        _check(self)
+        check_options(self, "registration: ", {"> 0": "*"})
         if not self.radii or not all(math.isfinite(r) and r > 0 for r in self.radii):
             raise ConfigError(f"registration: radii are {self.radii}; wanted positive numbers, wide to narrow")

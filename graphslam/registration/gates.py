@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of
 from graphslam.registration.config import RegistrationConfig
@@ -71,11 +71,7 @@ class MatchGates:
     mode_distance: float = 1.5
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            share = f.name in ("fitness", "fitness_upright", "margin")
-            if math.isnan(value) or value < 0 or (share and value > 1):
-                raise ConfigError(f"gates of a match: {f.name} = {value}; wanted {'0 … 1' if share else '≥ 0'}")
+        check_options(self, "gates of a match: ", {"in [0, 1]": "fitness fitness_upright margin", "≥ 0 or inf": "*"})
 
 
 def shift_between(T: ArrayLike, T_prior: ArrayLike) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.gates import MatchGates
@@ -62,14 +63,13 @@ class PairConfig:
     them."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, (int, float)) and not isinstance(value, bool):
-                zero = f.name in ("cloud_level", "least_score", "score_margin", "contradiction")
-                if math.isnan(value) or value < 0 or (value == 0 and not zero):
-                    raise ConfigError(f"pairs of submaps: {f.name} = {value}; wanted {'≥' if zero else '>'} 0")
-        if not 0 < self.chi2_level < 1 or min(*self.least, *self.most) <= 0:
+        ranges = {
+            "≥ 0 or inf": "cloud_level least_score score_margin contradiction",
+            "in (0, 1)": "chi2_level",
+            "> 0 or inf": "*",
+        }
+        check_options(self, "pairs of submaps: ", ranges)
+        if min(*self.least, *self.most) <= 0:
             raise ConfigError(
-                f"pairs of submaps: chi2_level = {self.chi2_level}, least = {self.least}, most = {self.most}; wanted "
-                "a level in (0, 1) and positive half widths"
+                f"pairs of submaps: least = {self.least}, most = {self.most}; wanted positive half widths"
             )

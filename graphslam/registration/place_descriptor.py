@@ -13,13 +13,14 @@ registration, gates and the graph.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from graphslam.core.config import check_options
 from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
@@ -53,12 +54,10 @@ class DescriptorConfig:
     """Number of places with the most similar ring keys that are compared."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not math.isfinite(value) or (value <= 0 and f.name not in ("low", "high", "blur")):
-                raise ConfigError(f"place descriptor: {f.name} = {value}; wanted a positive number")
-        if self.high <= self.low or self.known > 1 or self.blur < 0:
-            raise ConfigError(f"place descriptor: band {self.low} … {self.high}, known {self.known}, blur {self.blur}")
+        ranges = {"finite": "low high", "≥ 0": "blur", "in (0, 1]": "known", "> 0": "*"}
+        check_options(self, "place descriptor: ", ranges)
+        if self.high <= self.low:
+            raise ConfigError(f"place descriptor: band {self.low} … {self.high}; wanted low < high")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
 from graphslam.core.points import check_pose, evenly_spaced, finite_points, transform_points, voxel_downsample
@@ -113,10 +114,7 @@ class SearchConfig:
     """Modes of a coarse field that are refined in the finer one."""
 
     def __post_init__(self) -> None:
-        for name in ("most_points", "apart", "turned", "coarse_points", "coarse_modes"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"search: {name} is {value}; wanted a positive number")
+        check_options(self, "search: ", {"> 0": "*"})
 
 
 @dataclass(frozen=True, slots=True)

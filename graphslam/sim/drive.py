@@ -9,7 +9,8 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.se3 import quat_multiply, quat_normalize
 from graphslam.core.trajectory import Trajectory
@@ -42,11 +43,7 @@ class DriveConfig:
     """Time at rest before it starts [s]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            least_ok = value >= 0 if name in ("wheelbase", "stand") else value > 0
-            if not (np.isfinite(value) and least_ok):
-                raise ConfigError(f"drive: {name} = {value}; wanted a number above 0")
+        check_options(self, "drive: ", {"≥ 0": "wheelbase stand", "> 0": "*"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton.false_correspondences import split_false_correspondences
@@ -29,9 +30,7 @@ from graphslam.skeleton.weak_modes import WeakMode, weakest_modes
 
 logger = logging.getLogger(__name__)
 Method = Literal["gn", "cg", "blocks", "levels"]
-METHODS: tuple[Method, ...] = ("gn", "cg", "blocks", "levels")
 Start = Literal["forward", "chain", "odometry"]
-STARTS: tuple[Start, ...] = ("forward", "chain", "odometry")
 
 
 @dataclass(frozen=True)
@@ -88,11 +87,7 @@ class RelaxConfig:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        for name, value, known in (("method", self.method, METHODS), ("start", self.start, STARTS)):
-            if value not in known:
-                raise ConfigError(f"unknown {name} {value!r} of a relaxation; known: {', '.join(known)}")
-        if self.iterations < 1 or self.inner < 1 or self.threads < 1 or self.gain < 0 or self.move < 0:
-            raise ConfigError("iterations, inner and threads of a relaxation are at least 1, gain and move at least 0")
+        check_options(self, "relaxation: ", {"≥ 1": "iterations inner threads", "≥ 0": "gain move"})
 
     @classmethod
     def paper(cls) -> RelaxConfig:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from graphslam.core.errors import ConfigError, IndeterminateError
+from graphslam.core.config import check_options
+from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
@@ -49,8 +50,8 @@ class GncConfig:
     max_rounds: int = 100
 
     def __post_init__(self) -> None:
-        if not (0.5 < self.confidence < 1.0 and self.growth > 1.0 and self.max_rounds >= 1):
-            raise ConfigError(f"graduated non-convexity cannot work with {self}")
+        ranges = {"in (0.5, 1)": "confidence", "> 1 or inf": "growth", "≥ 1": "max_rounds"}
+        check_options(self, "graduated non-convexity: ", ranges)
 
 
 class GncSolver(BatchSolver):

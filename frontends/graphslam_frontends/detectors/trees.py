@@ -34,7 +34,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.records import LandmarkObservations, LaserScans
 from graphslam_frontends.detectors import kernels
@@ -76,13 +77,8 @@ class TreeDetectorConfig:
     """Fixed noise: σ_bearing [rad]."""
 
     def __post_init__(self) -> None:
-        for name in ("max_range", "max_width", "range_sigma", "bearing_sigma"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"tree detector: {name} = {getattr(self, name)}; wanted > 0")
-        if not self.range_slope >= 0:
-            raise ConfigError(f"tree detector: range_slope = {self.range_slope}; wanted ≥ 0")
-        if self.noise not in ("fixed", "fit"):
-            raise ConfigError(f"tree detector: noise = {self.noise!r}; known: fixed, fit")
+        ranges = {"> 0 or inf": "max_range max_width range_sigma bearing_sigma", "≥ 0 or inf": "range_slope"}
+        check_options(self, "tree detector: ", ranges)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood
 
@@ -82,28 +81,15 @@ class GridFilterConfig:
     """Number of threads for weights and map updates; results do not depend on it."""
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("particles", 1),
-            ("weight_beams", 1),
-            ("threads", 1),
-            ("map_beams", 0),
-            ("young", 0),
-        ):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ {least}")
-        if not (math.isfinite(self.lift) and 0.0 <= self.lift <= 1.0):
-            raise ConfigError(f"lift = {self.lift}; wanted 0 … 1 voxels")
-        if not 0.0 < self.ess_fraction <= 1.0:
-            raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")
-        for name in ("voxel_size", "endpoint_effective_beams"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number above 0")
-        walks = ("walk_scale", "position_walk", "height_walk", "heading_walk", "heading_turn", "tilt_walk")
-        for name in ("motion_scale", *walks):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number ≥ 0")
-        if self.likelihood not in ("endpoint", "cast", "upright"):
-            raise ConfigError(f"likelihood = {self.likelihood!r}; known: endpoint, cast, upright")
+        walks = "walk_scale position_walk height_walk heading_walk heading_turn tilt_walk"
+        ranges = {
+            "> 0": "voxel_size endpoint_effective_beams",
+            "≥ 1": "particles weight_beams threads",
+            "≥ 0": f"map_beams young motion_scale {walks}",
+            "in [0, 1]": "lift",
+            "in (0, 1]": "ess_fraction",
+        }
+        check_options(self, "", ranges)
         self.beam_model()
         self.by_end_points(self.weight_beams)
         self.by_casting(self.weight_beams)

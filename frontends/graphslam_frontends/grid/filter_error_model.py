@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of, remove_roll_pitch
@@ -53,12 +54,7 @@ class ErrorPassThrough:
     filter is worse than dead reckoning."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"errors passed on: {name} = {value}; wanted ≥ 0")
-        if max(self.heading, self.position) > 1:
-            raise ConfigError("errors passed on: wanted shares ≤ 1 of heading and position")
+        check_options(self, "errors passed on: ", {"in [0, 1]": "heading position", "≥ 0": "*"})
 
     def covariance(self, reckoned: Array, length: float, particles: int, *, tilt: float | None = None) -> Array:
         """Covariance to add at the end of a path, right tangent, of the size of ``reckoned``.
@@ -118,10 +114,7 @@ class FilterDrift:
     """σ of roll and pitch, independent of the length [rad]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"filter drift: {name} = {value}; wanted ≥ 0")
+        check_options(self, "filter drift: ", {"≥ 0": "*"})
         if self.tilt <= 0:
             raise ConfigError("filter drift: σ of roll and pitch must be > 0, or covariances are singular")
 

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
@@ -67,10 +68,9 @@ class KissIcpConfig:
     """Deskew points to the stamp of the scan, if they have times of their own."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.min_range < self.max_range < np.inf:
+        check_options(self, "kiss-icp: ", {"> 0": "voxel_size max_range", "≥ 0": "min_range"})
+        if not self.min_range < self.max_range:
             raise ConfigError(f"kiss-icp: min_range = {self.min_range}; wanted 0 … max_range {self.max_range}")
-        if self.voxel_size is not None and not 0.0 < self.voxel_size < np.inf:
-            raise ConfigError(f"kiss-icp: voxel_size = {self.voxel_size}; wanted > 0, or none")
 
     def registration(self) -> Any:
         """The odometry of the package in its initial state, with one thread, so that runs are reproducible."""

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam_frontends.detectors.trees import TreeDetectorConfig
@@ -33,10 +34,12 @@ class RangeBearingNoise:
     """[m]."""
 
     def __post_init__(self) -> None:
-        if not (self.range_sigma > 0 and self.range_slope >= 0 and self.bearing_sigma > 0):
-            raise ConfigError(f"range-bearing noise must be positive, got {self}")
-        if not (self.range_scale > 0 and np.isfinite(self.range_offset)):
-            raise ConfigError(f"range_scale must be > 0 and range_offset finite, got {self}")
+        ranges = {
+            "> 0 or inf": "range_sigma bearing_sigma range_scale",
+            "≥ 0 or inf": "range_slope",
+            "finite": "range_offset",
+        }
+        check_options(self, "range-bearing noise: ", ranges)
 
     def variances(self, ranges: Array) -> Array:
         """``(q, 2)`` variances of range and bearing."""
@@ -71,8 +74,7 @@ class StoppingConfig:
     study cut the log at the same places; 0 = off."""
 
     def __post_init__(self) -> None:
-        if self.scans < 0:
-            raise ConfigError(f"stopping.scans = {self.scans}; wanted ≥ 0")
+        check_options(self, "stopping.", {"≥ 0": "scans"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,10 +91,8 @@ class DelayedInitialisation:
     """Least share of the particle weights with fits that meet both criteria."""
 
     def __post_init__(self) -> None:
-        if self.min_ranges < 3:
-            raise ConfigError(f"delayed.min_ranges = {self.min_ranges}; wanted ≥ 3")
-        if not (self.spread > 0 and self.margin > 0 and 0 < self.support <= 1):
-            raise ConfigError(f"delayed start needs spread > 0, margin > 0 and 0 < support ≤ 1, got {self}")
+        ranges = {"≥ 3": "min_ranges", "> 0 or inf": "spread margin", "in (0, 1]": "support"}
+        check_options(self, "delayed.", ranges)
 
 
 DELAYED = DelayedInitialisation()
@@ -132,12 +132,7 @@ class ObservationConfig:
     """Tree detector, used if the log has raw scans instead of landmark observations."""
 
     def __post_init__(self) -> None:
-        if not self.longest_gap >= 0:
-            raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
-        if not 0 < self.gate <= GATE_NEW:
-            raise ConfigError(f"gate = {self.gate}; wanted 0 < gate ≤ {GATE_NEW}")
-        if not self.outlier_gate >= 0:
-            raise ConfigError(f"outlier_gate = {self.outlier_gate}; wanted ≥ 0")
+        check_options(self, "", {"≥ 0 or inf": "longest_gap outlier_gate", f"in (0, {GATE_NEW}]": "gate"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,14 +150,7 @@ class FilterConfig(ObservationConfig):
 
     def __post_init__(self) -> None:
         ObservationConfig.__post_init__(self)
-        if self.particles < 1:
-            raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
-        if self.proposal not in ("1.0", "2.0"):
-            raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
-        if self.association not in ("likelihood", "known"):
-            raise ConfigError(f"association = {self.association!r}; known: likelihood, known")
-        if not 0 < self.ess_fraction <= 1:
-            raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")
+        check_options(self, "", {"≥ 1": "particles", "in (0, 1]": "ess_fraction"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,9 +176,7 @@ class SensorBiasConfig:
     """Of the position of the sensor on the robot, ahead and to the left [m]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ConfigError(f"biases.{name} = {getattr(self, name)}; wanted a finite σ ≥ 0")
+        check_options(self, "biases.", {"≥ 0": "*"})
         for one, other in (("yaw_bias", "turn_per_metre"), ("sensor_yaw", "range_scale")):
             if getattr(self, one) and getattr(self, other):
                 raise ConfigError(
@@ -231,8 +217,6 @@ class RbpfEkfConfig(FilterConfig):
 
     def __post_init__(self) -> None:
         FilterConfig.__post_init__(self)
-        if self.handover not in ("smoothed", "moments", "pooled"):
-            raise ConfigError(f"handover = {self.handover!r}; known: smoothed, moments, pooled")
         if self.pooled < 0 or self.pooled == 1:
             raise ConfigError(
                 f"pooled = {self.pooled}; wanted 0 (off) or ≥ 2: one filter has no spread between filters"

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options
 from graphslam_frontends.landmarks.config import ObservationConfig, RangeBearingNoise, StoppingConfig
 
 
@@ -22,13 +20,7 @@ class EkfFilterConfig(ObservationConfig):
 
     def __post_init__(self) -> None:
         ObservationConfig.__post_init__(self)
-        if self.association not in ("known", "nearest", "jcbb"):
-            raise ConfigError(f"association = {self.association!r}; known: known, nearest, jcbb")
-        for name in ("max_nodes", "confirm_hits", "drop_misses", "drop_scans", "min_hits"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ 1")
-        if not (np.isfinite(self.max_range) and self.max_range > 0):
-            raise ConfigError(f"max_range = {self.max_range}; wanted a finite number > 0")
+        check_options(self, "", {"≥ 1": "max_nodes confirm_hits drop_misses drop_scans min_hits", "> 0": "max_range"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +40,4 @@ class EkfConfig(EkfFilterConfig):
 
     def __post_init__(self) -> None:
         EkfFilterConfig.__post_init__(self)
-        if self.handover not in ("filter", "smoothed"):
-            raise ConfigError(f"handover = {self.handover!r}; known: filter, smoothed")
-        if not self.trim >= 0:
-            raise ConfigError(f"trim = {self.trim}; wanted ≥ 0")
+        check_options(self, "", {"≥ 0 or inf": "trim"})

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -53,10 +54,8 @@ class PointsConfig:
     """χ² gate (probability, 3 dof) of an observation against all others; those beyond it are left out and counted."""
 
     def __post_init__(self) -> None:
-        if self.max_distance <= 0 or min(self.max_scans, self.min_hits) < 1:
-            raise ConfigError("limits of a submap in space are not positive; wanted > 0 metres and ≥ 1 of the others")
-        if not 0.5 < self.gate < 1.0:
-            raise ConfigError(f"gate = {self.gate}; wanted between 0.5 and 1")
+        ranges = {"> 0 or inf": "max_distance", "≥ 1": "max_scans min_hits", "in (0.5, 1)": "gate"}
+        check_options(self, "", ranges)
 
 
 class Points(FrontEnd):

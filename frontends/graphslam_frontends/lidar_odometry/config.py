@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 
 SPACING = 0.2
@@ -30,13 +29,8 @@ class LidarOdometryConfig:
     """Deskew points to the stamp of the scan, if they have times of their own."""
 
     def __post_init__(self) -> None:
-        for name in ("max_range", "window"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"lidar odometry: {name} = {value}; wanted > 0")
-        if not 0 <= self.min_range < self.max_range:
+        check_options(self, "lidar odometry: ", {"> 0": "max_range window", "≥ 0": "min_range", "≥ 100": "most_points"})
+        if not self.min_range < self.max_range:
             raise ConfigError(f"lidar odometry: min_range = {self.min_range}; wanted 0 … max_range {self.max_range}")
         if not self.levels or any(not a > b for a, b in zip(self.levels, self.levels[1:])) or self.levels[-1] <= 0:
             raise ConfigError(f"lidar odometry: levels = {self.levels}; wanted edges in metres, from coarse to fine")
-        if self.most_points < 100:
-            raise ConfigError(f"lidar odometry: most_points = {self.most_points}; wanted ≥ 100")

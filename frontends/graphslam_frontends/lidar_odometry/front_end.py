@@ -12,6 +12,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.dense import CloudMap
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.findings import Finding
@@ -85,12 +86,8 @@ class LidarSubmapConfig:
     """Probability that a voxel is occupied, given that a beam ended in it."""
 
     def __post_init__(self) -> None:
-        for name in ("length", "voxel_size", "reach"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"submap: {name} = {value}; wanted > 0")
-        if not 1 <= self.scans <= MOST_SCANS or self.points < 1:
-            raise ConfigError(f"submap: wanted 1 ≤ scans ≤ {MOST_SCANS} and points ≥ 1")
+        ranges = {"> 0": "length voxel_size reach", f"in [1, {MOST_SCANS}]": "scans", "≥ 1": "points"}
+        check_options(self, "submap: ", ranges)
         self.beam_model()
 
     def beam_model(self) -> BeamModel:

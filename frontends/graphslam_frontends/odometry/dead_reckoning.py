@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError, GeometryError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter
@@ -74,11 +75,7 @@ class DeadReckoningNoise:
     """Least σ of the position of an increment [m]."""
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            positive = name == "floor_position"
-            if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
-                raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
+        check_options(self, "dead reckoning: ", {"> 0": "floor_position", "≥ 0": "*"})
 
 
 def integrate_imu_and_wheels(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
@@ -68,12 +69,7 @@ class MotionNoise:
     """σ added to the heading of every increment [rad]."""
 
     def __post_init__(self) -> None:
-        rates = ("speed", "speed_fraction", "speed_walk", "steering", "yaw_rate", "yaw_rate_fraction", "yaw_walk")
-        for name in (*rates, "lateral", "heading"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"motion noise {name} = {getattr(self, name)}; wanted ≥ 0")
-        if not (self.floor_position > 0 and self.floor_heading > 0):
-            raise ConfigError("motion noise floors must be > 0: an increment needs an invertible covariance")
+        check_options(self, "motion noise: ", {"> 0 or inf": "floor_position floor_heading", "≥ 0 or inf": "*"})
 
     def as_array(self) -> Array:
         """As the array that the kernels expect."""

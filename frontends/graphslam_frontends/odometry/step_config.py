@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam_frontends.odometry.motion import MotionNoise
@@ -61,21 +60,12 @@ class StepConfig:
     over them."""
 
     def __post_init__(self) -> None:
-        positive = {"period": self.period, "max_range": self.max_range}
-        for name in ("range_sigma", "longest_record"):
-            positive[name] = getattr(self, name)
-        for name, value in positive.items():
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"steps: {name} = {value}; wanted > 0")
-        for name in ("min_range", "constant_yaw_bias", "constant_scale", "odometry_tilt_sigma"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted ≥ 0")
-        for name in ("yaw_bias", "yaw_per_metre"):
-            if not np.isfinite(getattr(self, name)):
-                raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted a finite number")
-        if self.silent not in ("free", "unknown"):
-            raise ConfigError(f"steps: silent = {self.silent!r}; known: free, unknown")
-        if self.most_points < 1:
-            raise ConfigError(f"steps: most_points = {self.most_points}; wanted ≥ 1")
+        ranges = {
+            "> 0": "period max_range range_sigma longest_record",
+            "≥ 0": "min_range constant_yaw_bias constant_scale odometry_tilt_sigma",
+            "finite": "yaw_bias yaw_per_metre",
+            "≥ 1": "most_points",
+        }
+        check_options(self, "steps: ", ranges)
         if self.max_range is not None and self.max_range <= self.min_range:
             raise ConfigError(f"steps: max_range = {self.max_range}; wanted > min_range {self.min_range}")

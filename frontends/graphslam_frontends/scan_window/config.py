@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 
 MOST_STEPS = 60
@@ -33,10 +32,7 @@ class ScanWindowConfig:
     """Most points of a scan to match to surfaces."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.seconds) and self.seconds > 0):
-            raise ConfigError(f"window: seconds = {self.seconds}; wanted > 0")
-        if self.points < 6:
-            raise ConfigError(f"window: points = {self.points}; wanted ≥ 6")
+        check_options(self, "window: ", {"> 0": "seconds", "≥ 6": "points"})
         if self.lay is not None and not self.spacing <= self.lay <= self.seconds:
             raise ConfigError(f"window: lay = {self.lay} s; wanted between two steps ({self.spacing} s) and seconds")
 

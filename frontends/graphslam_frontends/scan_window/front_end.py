@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -53,12 +54,7 @@ class WindowSubmapConfig:
     """Probability that a voxel is occupied, given that a beam ended in it."""
 
     def __post_init__(self) -> None:
-        for name in ("length", "voxel_size"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"submap: {name} = {value}; wanted > 0")
-        if not (np.isfinite(self.seconds) and self.seconds >= 0):
-            raise ConfigError(f"submap: seconds = {self.seconds}; wanted ≥ 0")
+        check_options(self, "submap: ", {"> 0": "length voxel_size", "≥ 0": "seconds"})
         self.beam_model()
 
     def beam_model(self) -> BeamModel:

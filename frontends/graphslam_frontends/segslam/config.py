@@ -4,25 +4,15 @@ assume a robot at some tenths to a few metres per second."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.registration.config import RegistrationConfig
 
 MAX_YAW = 0.8
 """Greatest half width of a search in heading [rad]."""
-
-
-def _check(config: Any, part: str, *, positive: tuple[str, ...] = (), unit: tuple[str, ...] = ()) -> None:
-    """Reject numbers that are NaN or negative, ``positive`` ones that are 0, and ``unit`` ones above 1."""
-    for f in fields(config):
-        value = getattr(config, f.name)
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
-            continue
-        if math.isnan(value) or value < 0 or (f.name in positive and value == 0) or (f.name in unit and value > 1):
-            wanted = "0 … 1" if f.name in unit else "> 0" if f.name in positive else "≥ 0"
-            raise ConfigError(f"{part}.{f.name} = {value}; wanted {wanted}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,22 +49,14 @@ class SegmentationConfig:
     """One decision for the filter, or one per particle; with the latter fewer segments fit together."""
 
     def __post_init__(self) -> None:
-        _check(
-            self,
-            "segmentation",
-            positive=(
-                "window",
-                "tolerance",
-                "every",
-                "max_length",
-                "max_seconds",
-            ),
-            unit=("score", "relative_score"),
-        )
+        ranges = {
+            "> 0 or inf": "window tolerance every max_length max_seconds",
+            "in [0, 1]": "score relative_score",
+            "≥ 0 or inf": "*",
+        }
+        check_options(self, "segmentation.", ranges)
         if self.min_length > self.max_length or self.min_seconds > self.max_seconds:
             raise ConfigError(f"segmentation: the minimum size is above the maximum, got {self}")
-        if self.decide not in ("filter", "particle"):
-            raise ConfigError(f"segmentation.decide = {self.decide!r}; known: filter, particle")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +85,7 @@ class SegmentCandidateConfig:
     """Most candidates of one particle at one time, nearest (in σ) first."""
 
     def __post_init__(self) -> None:
-        _check(self, "winnowing", positive=("sigma", "sigmas", "keep"))
+        check_options(self, "winnowing.", {"> 0 or inf": "sigma sigmas keep", "≥ 0 or inf": "*"})
 
     def rise(self, length: Any) -> Any:
         """Height allowance after a path of a length [m]; arrays too."""
@@ -142,18 +124,8 @@ class CandidateSearch:
     """Most searches at one time, of all particles together."""
 
     def __post_init__(self) -> None:
-        _check(
-            self,
-            "search",
-            positive=(
-                "grid",
-                "yaw_step",
-                "max_radius",
-                "source_radius",
-                "source_points",
-                "most_searches",
-            ),
-        )
+        positive = "grid yaw_step max_radius source_radius source_points most_searches"
+        check_options(self, "search.", {"> 0 or inf": positive, "≥ 0 or inf": "*"})
 
     def yaw_width(self, length: float) -> float:
         """Half width in heading after a path of a length [m]."""
@@ -189,14 +161,12 @@ class ChoiceConfig:
     """Score of a match: registration (eq. 18), localisation (eq. 19), or both."""
 
     def __post_init__(self) -> None:
-        _check(
-            self,
-            "choice",
-            positive=("every", "shift", "null_weight", "position_sigma", "angle_sigma"),
-            unit=("fitness", "fitness_upright", "margin"),
-        )
-        if self.method not in ("registration", "localisation", "both"):
-            raise ConfigError(f"choice.method = {self.method!r}; known: registration, localisation, both")
+        ranges = {
+            "> 0 or inf": "every shift null_weight position_sigma angle_sigma",
+            "in [0, 1]": "fitness fitness_upright margin",
+            "≥ 0 or inf": "*",
+        }
+        check_options(self, "choice.", ranges)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +179,7 @@ class HandoverConfig:
     """Moment matching of the paper instead of particles plus drift: for comparison only."""
 
     def __post_init__(self) -> None:
-        _check(self, "handover", positive=("drift_scale",))
+        check_options(self, "handover.", {"> 0 or inf": "drift_scale", "≥ 0 or inf": "*"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,6 +204,4 @@ class SegSlamConfig:
     differ only in the older maps they enter."""
 
     def __post_init__(self) -> None:
-        _check(self, "segslam")
-        if self.inside not in ("filter", "scan-window"):
-            raise ConfigError(f"segslam.inside = {self.inside!r}; known: filter, scan-window")
+        check_options(self, "segslam.", {"≥ 0 or inf": "*"})

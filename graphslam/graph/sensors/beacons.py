@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from graphslam.core.config import flattened_field
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options, flattened_field
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.records import LandmarkObservations
 from graphslam.graph.factor_graph_state import FactorGraphState
@@ -38,10 +38,8 @@ class BeaconConfig:
     """Robust kernel on each distance, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
-        if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma > 0):
-            raise ConfigError(f"beacons.sigma must be positive, got {self.sigma}")
-        if not (np.isfinite(self.every) and self.every >= 0 and 0 < self.spread < 1 and self.least >= 3):
-            raise ConfigError(f"beacons.every ≥ 0, 0 < beacons.spread < 1 and beacons.least ≥ 3 are wanted, got {self}")
+        ranges = {"> 0": "sigma", "≥ 0": "every", "in (0, 1)": "spread", "≥ 3": "least"}
+        check_options(self, "beacons.", ranges)
 
 
 @dataclass(slots=True, eq=False)

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from graphslam.core.config import flattened_field
-from graphslam.core.errors import ConfigError
+from graphslam.core.config import check_options, flattened_field
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.records import Compass
 from graphslam.core.se3 import quat_rotate
@@ -40,14 +39,8 @@ class CompassConfig:
     """Robust kernel on each reading, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "declination_sigma", "hard_iron"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"compass.{name} must be positive, got {value}")
-        if not (np.isfinite(self.every) and self.every >= 0):
-            raise ConfigError(f"compass.every must not be negative, got {self.every}")
-        if self.declination is not None and not np.isfinite(self.declination):
-            raise ConfigError(f"compass.declination must be a number, got {self.declination}")
+        ranges = {"> 0": "sigma declination_sigma hard_iron", "≥ 0": "every", "finite": "declination"}
+        check_options(self, "compass.", ranges)
 
 
 class CompassFactors(PendingMeasurements):

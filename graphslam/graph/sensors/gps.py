@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.config import flattened_field
+from graphslam.core.config import check_options, flattened_field
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
@@ -64,10 +64,7 @@ class GpsConfig:
     errors: Literal["stated", "fitted"] = "fitted"
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "baseline", "bias_sigma", "segment_gap", "bias_time"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"gps.{name} must be positive, got {value}")
+        check_options(self, "gps.", {"> 0": "sigma baseline bias_sigma segment_gap bias_time"})
         if self.bias_time is not None and self.bias_sigma is None:
             raise ConfigError("gps.bias_time needs gps.bias_sigma, the σ of these errors")
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core import se3
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.geometry import Array
 from graphslam.evidence.layout import BRICK_VOXELS
@@ -41,7 +42,7 @@ class SurfaceConfig:
     """… and the largest number of neighbours."""
     most_range: float = 40.0
     """Points farther from the scanner are ignored [m]."""
-    data: str = "planes"
+    data: Literal["planes", "rays"] = "planes"
     """``planes``: distances to the plane of each point; ``rays``: along its beam (truncated signed distance)."""
     enough: float = 0.06
     """Least weight of a known voxel: a point whose normal passes through its centre counts 1, at the rim 1/16."""
@@ -65,19 +66,15 @@ class SurfaceConfig:
     """Step size of the evolution."""
 
     def __post_init__(self) -> None:
-        for name in ("voxel", "normal_radius", "most_range", "enough", "flatness", "carve_ratio", "dt"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"surface: {name} = {value}; wanted above 0")
-        if not (np.isfinite(self.smoothing) and self.smoothing >= 0) or self.dt * (1.0 + 8.0 * self.smoothing) > 2.0:
+        ranges = {
+            "> 0": "voxel normal_radius most_range enough flatness carve_ratio dt",
+            "≥ 0": "smoothing steps redistance_steps",
+            "≥ 1": "carve_beams",
+            "≥ 5": "normal_neighbours",
+        }
+        check_options(self, "surface: ", ranges)
+        if self.dt * (1.0 + 8.0 * self.smoothing) > 2.0:
             raise ConfigError(f"surface: smoothing {self.smoothing}, dt {self.dt}; wanted dt · (1 + 8 smoothing) ≤ 2")
-        if self.data not in ("planes", "rays"):
-            raise ConfigError(f"surface: data = {self.data!r}; known: planes, rays")
-        if self.normal_neighbours < 5 or self.steps < 0 or self.redistance_steps < 0 or self.carve_beams < 1:
-            raise ConfigError(
-                f"surface: normal_neighbours {self.normal_neighbours}, steps {self.steps}, redistance_steps "
-                f"{self.redistance_steps}, carve_beams {self.carve_beams}; wanted ≥ 5, ≥ 0, ≥ 0, ≥ 1"
-            )
 
     @property
     def halo(self) -> int:

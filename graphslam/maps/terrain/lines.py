@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GeometryError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
@@ -47,10 +48,7 @@ class DetectorConfig:
     """Higher points above the ground are ignored."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-                raise ConfigError(f"terrain: {f.name} = {value}; wanted a number above 0")
+        check_options(self, "terrain: ", {"> 0": "*"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,8 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import ConfigError, DataError, FormatError
+from graphslam.core.config import check_options
+from graphslam.core.errors import DataError, FormatError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
 from graphslam.maps.terrain.vehicle import Vehicle
@@ -39,11 +40,8 @@ class CostConfig:
     than a gap between two hazards, and later observations are finer. None: all block, for a final map."""
 
     def __post_init__(self) -> None:
-        for name in ("hazard", "unknown", "provisional", "margin"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"cost of terrain: {name} = {getattr(self, name)}; wanted ≥ 0")
-        if self.closing_bands is not None and self.closing_bands < 1:
-            raise ConfigError(f"cost of terrain: closing_bands = {self.closing_bands}; wanted ≥ 1, or none")
+        ranges = {"≥ 0 or inf": "hazard unknown provisional margin", "≥ 1": "closing_bands"}
+        check_options(self, "cost of terrain: ", ranges)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

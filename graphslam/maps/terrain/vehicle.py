@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.config import check_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 
@@ -36,10 +37,7 @@ class Vehicle:
     """Braking deceleration [m/s²]."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-                raise ConfigError(f"vehicle: {f.name} = {value}; wanted a number above 0")
+        check_options(self, "vehicle: ", {"> 0": "*"})
         if not self.climbable_step < self.clearance < self.height:
             raise ConfigError(
                 f"vehicle: climbable step {self.climbable_step}, clearance {self.clearance}, height {self.height} m; "
@@ -77,10 +75,7 @@ class LineSensor:
     sweep_time: float = 2.0
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-                raise ConfigError(f"sensor: {f.name} = {value}; wanted a number above 0")
+        check_options(self, "sensor: ", {"> 0": "*"})
 
     def band_edges(self, cells: tuple[float, ...] = CELLS) -> Array:
         """Ranges ``(b,)`` at which the bands end [m]: there neighbouring beams hit level ground one cell apart.

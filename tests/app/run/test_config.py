@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import tomllib
+from typing import Literal
 
 import pytest
 
@@ -14,6 +16,7 @@ from graphslam.app.worlds import simulate
 from graphslam.backend.config import GpsOptions, ImuOptions
 from graphslam.core.config import (
     build_config,
+    check_options,
     dump_toml,
     merge_options,
     options_dict,
@@ -173,3 +176,35 @@ def test_broken_toml_is_refused(tmp_path):
         read_toml(file)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_toml(tmp_path / "nothing.toml")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Checked:
+    gain: float = 1.0
+    share: float | None = None
+    rounds: int = 2
+    far: float = math.inf
+    rule: Literal["near", "joint"] = "near"
+    on: bool = False
+
+    def __post_init__(self):
+        check_options(self, "checked.", {"in (0, 1]": "share", "> 0 or inf": "far", "≥ 1": "rounds", "finite": "*"})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"share": 0.0}, "checked.share = 0.0; wanted in (0, 1]"),
+        ({"share": 1.1}, "checked.share = 1.1; wanted in (0, 1]"),
+        ({"share": math.nan}, "checked.share = nan; wanted in (0, 1]"),
+        ({"far": 0.0}, "checked.far = 0.0; wanted > 0 or inf"),
+        ({"far": math.nan}, "checked.far = nan; wanted > 0 or inf"),
+        ({"rounds": 0}, "checked.rounds = 0; wanted ≥ 1"),
+        ({"gain": -math.inf}, "checked.gain = -inf; wanted finite"),
+        ({"rule": "far"}, "checked.rule = 'far'; known: near, joint"),
+    ],
+)
+def test_options_outside_their_range_are_refused(wrong, message):
+    Checked(share=1.0, far=1e9, rounds=1, gain=-5.0, rule="joint")
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Checked(**wrong)

@@ -89,7 +89,7 @@ def test_what_is_missing_is_named() -> None:
         submaps_of(replace(log, streams={"odometry": log["odometry"]}))
     with pytest.raises(MissingDataError, match="no odometry in space"):
         submaps_of(replace(log, streams={"points": log["points"]}))
-    with pytest.raises(ConfigError, match="not positive"):
+    with pytest.raises(ConfigError, match="max_distance"):
         PointsConfig(max_distance=0.0)
     with pytest.raises(ConfigError, match="gate"):
         PointsConfig(gate=1.0)

@@ -118,5 +118,5 @@ def test_impossible_requests_are_refused():
         steering_odometry(controls("rear-axle"), np.array([-1.0, 0.5]), MotionNoise())
     with pytest.raises(ConfigError, match="speed"):
         MotionNoise(speed=-1.0)
-    with pytest.raises(ConfigError, match="floors"):
+    with pytest.raises(ConfigError, match="floor_heading"):
         MotionNoise(floor_heading=0.0)

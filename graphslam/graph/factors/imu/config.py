@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from graphslam.core.config import flattened_field
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.config import check_options, flattened_field
+from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
@@ -58,12 +58,7 @@ class ImuConfig:
     robust: RobustKernel = flattened_field(RobustKernel("none", 2.385), robust="kind", robust_width="k")
 
     def __post_init__(self) -> None:
-        for name in ("longest", "pause", "window", "acceleration", "still"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"imu.{name} must be positive, got {value}")
-        if self.axes not in ("refuse", "warn", "ignore"):
-            raise ConfigError(f"imu.axes = {self.axes!r}; known: refuse, warn, ignore")
+        check_options(self, "imu.", {"> 0": "longest pause window acceleration still"})
 
     def span(self, dim: int) -> float:
         """Longest preintegrated measurement in a graph of that dimension [s]."""
