@@ -99,7 +99,7 @@ def find_loops(
     >>> len(found.ledger.table()) >= 0
     True
     """
-    return LoopSearch(config).look(graph, solver, submaps, last=True, progress=progress)
+    return last_value(LoopSearch(config).look_in_slices(graph, solver, submaps, last=True, progress=progress))
 
 
 class LoopSearch:
@@ -116,18 +116,6 @@ class LoopSearch:
         self._measurer: LoopMeasurer | None = None
         self._seen = 0
 
-    def look(
-        self,
-        graph: FactorGraph,
-        solver: GraphSolver,
-        submaps: Sequence[Submap],
-        *,
-        last: bool = False,
-        progress: bool = False,
-    ) -> LoopCloser:
-        """Search for loops; parameters and errors as in :func:`find_loops`; ``last``: no more submaps follow."""
-        return last_value(self.look_in_slices(graph, solver, submaps, last=last, progress=progress))
-
     def look_in_slices(
         self,
         graph: FactorGraph,
@@ -137,7 +125,10 @@ class LoopSearch:
         last: bool = False,
         progress: bool = False,
     ) -> Generator[None, None, LoopCloser]:
-        """:meth:`look` in slices of bounded work; the graph must not be changed in between."""
+        """Search in slices of bounded work; the graph must not be changed in between.
+
+        Parameters and errors as in :func:`find_loops`; ``last``: no more submaps follow.
+        """
         c = self.config
         if [s.key for s in submaps] != [s.key for s in graph.submaps]:
             raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))

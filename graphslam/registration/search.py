@@ -169,8 +169,10 @@ def make_lattice(
     return SearchLattice(axes[0], axes[1], axes[2] if n == 4 else np.zeros(1), axes[-1], (whole[0], whole[1], whole[2]))
 
 
-def score_lattice(points: Array, field: SearchField, around: Array, lattice: SearchLattice) -> npt.NDArray[np.uint32]:
-    """Sum of the field, in 1/255, at all points for every offset of a lattice.
+def _score_in_slices(
+    points: Array, field: SearchField, around: Array, lattice: SearchLattice
+) -> Generator[None, None, npt.NDArray[np.uint32]]:
+    """Sum of the field, in 1/255, at all points for every offset of a lattice, in slices of some headings.
 
     Parameters
     ----------
@@ -182,13 +184,6 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
     -------
     (headings, z, y, x) uint32
     """
-    return last_value(_score_in_slices(points, field, around, lattice))
-
-
-def _score_in_slices(
-    points: Array, field: SearchField, around: Array, lattice: SearchLattice
-) -> Generator[None, None, npt.NDArray[np.uint32]]:
-    """:func:`score_lattice` in slices of some headings."""
     phases = field._in_phases(lattice.steps)
     scores = np.zeros(lattice.shape, np.uint32)
     first = np.array([lattice.x[0], lattice.y[0], lattice.z[0]])
@@ -205,6 +200,9 @@ def _score_in_slices(
             yield
         score_block(cells[k : k + size], counts, steps, phases, scores[k : k + size])
     return scores
+
+
+score_lattice = at_once(_score_in_slices)
 
 
 def offset_pose(around: Array, offset: ArrayLike) -> Array:
@@ -229,7 +227,7 @@ def offset_pose(around: Array, offset: ArrayLike) -> Array:
     return np.concatenate([around[:3] + move[..., :3], turned], -1)
 
 
-def correlative_search(
+def search_in_slices(
     source: Any,
     field: SearchField,
     around: Any,
@@ -239,8 +237,10 @@ def correlative_search(
     *,
     coarse: SearchField | None = None,
     config: SearchConfig | None = None,
-) -> list[SearchStart]:
+) -> Generator[None, None, list[SearchStart]]:
     """Distinct candidate poses of the source in the map, best first.
+
+    In slices of bounded work; :data:`correlative_search` does them in one call.
 
     Parameters
     ----------
@@ -266,26 +266,7 @@ def correlative_search(
     list of SearchStart
         Local maxima of the lattice that are not near a better one. Empty without points, or without overlap with the
         map.
-
-    Notes
-    -----
-    Deterministic.
     """
-    return last_value(search_in_slices(source, field, around, half_widths, steps, keep, coarse=coarse, config=config))
-
-
-def search_in_slices(
-    source: Any,
-    field: SearchField,
-    around: Any,
-    half_widths: Sequence[float],
-    steps: Sequence[float] | None = None,
-    keep: int = 6,
-    *,
-    coarse: SearchField | None = None,
-    config: SearchConfig | None = None,
-) -> Generator[None, None, list[SearchStart]]:
-    """:func:`correlative_search` in slices of bounded work; the result is the same."""
     config = SearchConfig() if config is None else config
     T = check_pose(around, field.dim, what="pose to search around")
     p = finite_points(source, what="source points")
@@ -320,6 +301,9 @@ def search_in_slices(
         shown = (x, y, z, yaw) if field.dim == 3 else (x, y, yaw)
         starts.append(SearchStart(offset_pose(T, places[s]), float(score[s]), shown))
     return starts
+
+
+correlative_search = at_once(search_in_slices)
 
 
 def _shares(sums: npt.NDArray[np.uint32], points: int) -> npt.NDArray[np.float32]:
