@@ -8,6 +8,7 @@ distance from the start, and tilt.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -79,20 +80,20 @@ class Registration:
 
     T_target_source: Array
     covariance: Array
-    fitness: float
-    fitness_known: float
-    fitness_upright: float
-    known_share: float
-    rmse: float
-    inliers: int
-    degeneracy: float
     weakest: Array
-    weakest_sigma: float
-    tilt: float
-    shift: float
-    turn: float
-    converged: bool
     why: str
+    fitness: float = 0.0
+    fitness_known: float = math.nan
+    fitness_upright: float = math.nan
+    known_share: float = math.nan
+    rmse: float = math.nan
+    inliers: int = 0
+    degeneracy: float = 0.0
+    weakest_sigma: float = math.nan
+    tilt: float = math.nan
+    shift: float = math.nan
+    turn: float = math.nan
+    converged: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -353,23 +354,7 @@ def _moved(T_a: Array, T_b: Array) -> tuple[float, float]:
 
 
 def _no_result(start: Array, why: str) -> Registration:
-    planar = len(start) == 3
-    d, nan = (3 if planar else 6), float("nan")
+    dim, d = (2, 3) if len(start) == 3 else (3, 6)
     return Registration(
-        T_target_source=start,
-        covariance=np.full((d, d), nan),
-        fitness=0.0,
-        fitness_known=nan,
-        fitness_upright=nan,
-        known_share=nan,
-        rmse=nan,
-        inliers=0,
-        degeneracy=0.0,
-        weakest=np.full(2 if planar else 3, nan),
-        weakest_sigma=nan,
-        tilt=nan,
-        shift=nan,
-        turn=nan,
-        converged=False,
-        why=why,
+        T_target_source=start, covariance=np.full((d, d), np.nan), weakest=np.full(dim, np.nan), why=why
     )

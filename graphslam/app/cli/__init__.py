@@ -180,13 +180,9 @@ def _options(
     """Options before the name of a command."""
 
 
-cli_run.add_run_commands(app)
-cli_calibrate.add_calibrate_command(app)
-cli_join.add_join_commands(app)
-cli_map.add_map_command(app)
-cli_sessions.add_session_commands(app)
-cli_results.add_result_commands(app)
-cli_tools.add_tool_commands(app)
+for module in (cli_run, cli_calibrate, cli_join, cli_map, cli_sessions, cli_results, cli_tools):
+    for name, command in module.COMMANDS.items():
+        app.command(name)(command)
 app.add_typer(cli_data.app, name="data", cls=Commands)
 
 

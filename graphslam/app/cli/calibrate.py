@@ -12,11 +12,6 @@ from graphslam.core.atomic import atomic_open, check_file_target
 from graphslam.core.config import dump_toml
 
 
-def add_calibrate_command(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command("calibrate")(calibrate_command)
-
-
 def calibrate_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     frontend: str | None = typer.Option(None, help="Front end that reads the log. Default: by the streams of the log."),
@@ -60,3 +55,6 @@ def calibrate_command(
 
     note = "" if out is None else f"written to {out}: graphslam run {source} --config {out}"
     write_and_print(write, value, text, note, as_json=as_json)
+
+
+COMMANDS = {"calibrate": calibrate_command}

@@ -12,29 +12,22 @@ from graphslam.app.cli.run import JSON, MAX_SIZE
 from graphslam.app.cli.terminal import print_result, text_table, verdict_text, write_and_print
 from graphslam.core.atomic import atomic_open, check_file_target
 
+SUBMAPS = typer.Argument(
+    ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
+)
+ASSOCIATE = typer.Option("given", help="How landmarks are associated: given (by their ids), nearest or joint.")
+SCALE = typer.Option(None, help="Factor on the covariances of the submaps. Default: the value of the run.")
 SUBMAP_POSES = typer.Option(
     None, "--submap-poses", help="Cut a pose-graph file into submaps with this number of poses."
 )
 
 
-def add_join_commands(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("join")(join_command)
-    app.command("compare")(compare_command)
-
-
 def join_command(
-    source: str = typer.Argument(
-        ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
-    ),
+    source: str = SUBMAPS,
     method: str = typer.Option("eif-tree", help="Name of the method: eif-tree, eif-sequential, ekf, isam2 or batch."),
     polish: bool = typer.Option(True, help="Refine the joined map to the least-squares optimum."),
-    associate: str = typer.Option(
-        "given", help="How landmarks are associated: given (by their ids), nearest or joint."
-    ),
-    scale: float | None = typer.Option(
-        None, help="Factor on the covariances of the submaps. Default: the value of the run."
-    ),
+    associate: str = ASSOCIATE,
+    scale: float | None = SCALE,
     workers: int | None = typer.Option(None, help="Number of processes for eif-tree."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the joins of eif-tree."),
     submap_poses: int | None = SUBMAP_POSES,
@@ -95,19 +88,13 @@ def join_command(
 
 
 def compare_command(
-    source: str = typer.Argument(
-        ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
-    ),
+    source: str = SUBMAPS,
     methods: str | None = typer.Option(
         None, help="Names of methods, separated by commas. Default: isam2, batch, eif-tree, eif-sequential, ekf."
     ),
     polish: bool = typer.Option(True, help="Refine the result of every method to the least-squares optimum."),
-    associate: str = typer.Option(
-        "given", help="How landmarks are associated: given (by their ids), nearest or joint."
-    ),
-    scale: float | None = typer.Option(
-        None, help="Factor on the covariances of the submaps. Default: the value of the run."
-    ),
+    associate: str = ASSOCIATE,
+    scale: float | None = SCALE,
     memory: bool = typer.Option(True, help="Measure the peak memory of every method in a process of its own."),
     submap_poses: int | None = SUBMAP_POSES,
     figure: Path | None = typer.Option(None, help="PNG file for a plot of the methods before and after refinement."),
@@ -156,3 +143,6 @@ def compare_command(
 
     value["figure"] = str(figure)
     write_and_print(write, value, "\n".join(text), f"plot: {figure}", as_json=as_json, key="figure")
+
+
+COMMANDS = {"join": join_command, "compare": compare_command}

@@ -21,11 +21,6 @@ CANDIDATES = (
 )
 
 
-def add_map_command(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command("map")(map_command)
-
-
 def map_command(
     run: Path = typer.Argument(..., help="Folder of a finished run of dense submaps (evidence grids or clouds)."),
     grid: bool = typer.Option(False, "--grid", help="Write also the evidence grid, map.grid.npz."),
@@ -134,3 +129,6 @@ def _make_layer(run: Path, layer: Layer, log: str | None, as_json: bool) -> None
     print_result(
         facts, f"{text_table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json
     )
+
+
+COMMANDS = {"map": map_command}

@@ -12,13 +12,6 @@ from graphslam.app.cli.terminal import print_result, text_table
 SHOWN = ("loop", "verdict", "source", "submap_i", "submap_j", "fitness", "chi2", "weight", "effect", "factor_id", "why")
 
 
-def add_result_commands(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("loops")(loops_command)
-    app.command("report")(report_command)
-    app.command("export")(export_command)
-
-
 def loops_command(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
     history: bool = typer.Option(False, help="Show all decisions, also replaced ones."),
@@ -115,3 +108,6 @@ def export_command(
     place = None if datum is None else parse_datum(datum)
     file = export_run(run, place, format=format, heading=heading, confidence=confidence, out=out)
     print_result({"file": str(file), "format": format}, f"written to {file}", as_json=as_json)
+
+
+COMMANDS = {"loops": loops_command, "report": report_command, "export": export_command}

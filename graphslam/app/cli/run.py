@@ -60,13 +60,6 @@ SHORT = (
 EVERY = typer.Option(False, "--all", help="Print all metrics. Default: a summary.")
 
 
-def add_run_commands(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("run")(run_command)
-    app.command("demo")(demo_command)
-    app.command("simulate")(simulate_command)
-
-
 def run_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     frontend: list[str] = typer.Option(
@@ -285,3 +278,6 @@ def simulate_command(
         "meta": log.meta,
     }
     print_result(value, f"{text_table(rows)}\n{log.duration:.1f} s written to {out}", as_json=as_json)
+
+
+COMMANDS = {"run": run_command, "demo": demo_command, "simulate": simulate_command}

@@ -11,12 +11,6 @@ from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_
 from graphslam.app.cli.terminal import print_result, text_table
 
 
-def add_session_commands(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("merge")(merge_command)
-    app.command("localise")(localise_command)
-
-
 def merge_command(
     runs: list[Path] = typer.Argument(
         ..., help="Folders of at least two runs. The first pose of the first run is the origin."
@@ -86,3 +80,6 @@ def localise_command(
         "candidates": rows,
     }
     print_result(value, text, as_json=as_json)
+
+
+COMMANDS = {"merge": merge_command, "localise": localise_command}

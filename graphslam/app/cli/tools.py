@@ -13,16 +13,6 @@ from graphslam.core.atomic import atomic_open, check_file_target
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError, UnknownNameError
 
 
-def add_tool_commands(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("solve")(solve_command)
-    app.command("relax")(relax_command)
-    app.command("eval")(evaluate_command)
-    app.command("options")(options_command)
-    app.command("init")(init_command)
-    app.command("doctor")(doctor_command)
-
-
 def solve_command(
     file: str = typer.Argument(
         ..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or DATA-SET/FILE."
@@ -237,3 +227,13 @@ def doctor_command(
         bad = [f.name for f in findings if f.state == state]
         if bad:
             raise GraphSlamError(f"{len(bad)} {what}: {', '.join(bad)}")
+
+
+COMMANDS = {
+    "solve": solve_command,
+    "relax": relax_command,
+    "eval": evaluate_command,
+    "options": options_command,
+    "init": init_command,
+    "doctor": doctor_command,
+}
