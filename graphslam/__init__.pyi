@@ -48,7 +48,7 @@ from graphslam.app.verbs import refine_path as refine_path
 from graphslam.skeleton.relax import relax_skeleton as relax_skeleton
 from graphslam.app.run.pipeline import run as run
 from graphslam.app.worlds import simulate as simulate
-from graphslam.app.verbs import solve_file as solve_file
+from graphslam.app.solve_file import solve_file as solve_file
 from graphslam.app.verbs import solve_graph as solve_graph
 from graphslam.app.verbs import solvers as solvers
 from graphslam.app.studies import study as study

@@ -14,20 +14,20 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_same, read_consistently
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.config import RunConfig
 from graphslam.app.run.control import control_facts, control_findings, left_out_of_refinement
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.options import RunOptions
 from graphslam.app.run.run import Run
-from graphslam.app.run.run_inputs import read_inputs
+from graphslam.app.run.run_inputs import RunInputs, read_inputs
 from graphslam.app.run.source import log_of_run
 from graphslam.backend.back_end import find_config
-from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
+from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
 from graphslam.backend.refining import RefinedRun, refine_run
 from graphslam.backend.streams import ImuSource
-from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
@@ -50,8 +50,7 @@ from graphslam.maps.global_map import make_global_map
 from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.refined import map_of_frames
-from graphslam.maps.run_map import REACH_MARGIN, MapConfig, RunMap, make_run_map, solved_poses
-from graphslam.refine.config import RefineConfig
+from graphslam.maps.run_map import REACH_MARGIN, RunMap, make_run_map, solved_poses
 from graphslam_frontends.segslam.front_end import SegSlam
 
 logger = logging.getLogger(__name__)
@@ -181,7 +180,8 @@ def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> 
     """Refine the chosen alternative and compare it with check points; both have no influence on the choice."""
     if run.folder is None:
         return found
-    found, options = _refined(run, run.folder, found, submaps), RunOptions.of_folder(run.folder)
+    options = RunOptions.of_folder(run.folder)
+    found = _refined(run, options, found, submaps)
     graph, r, findings = found.choice.best.alternative.graph, found.refined, list(found.findings)
     if (rows := options.table("control")) is not None:
         facts = control_facts(graph, rows)
@@ -193,51 +193,52 @@ def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> 
     return replace(found, findings=findings)
 
 
-def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
+def _refined(run: Run, options: RunOptions, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
     """The chosen alternative refined with the scans of the run, if the run is refined."""
-    values = read_options(folder)
-    config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
-    inputs, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
-    if inputs is None or inputs.scans is None:
+    settings = options.settings
+    scans = _inputs_of(run).scans if settings.refine.use else None
+    if scans is None:
         return found
-    check_same((folder / "run.json", run.report.get("generation")), (folder / "inputs.npz", generation))
     solution = found.choice.best.alternative.solution
     solved = make_global_map(solution, list(submaps), {}, 1)
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
-        gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))
-    refined, findings = refine_run(config, inputs.scans, submaps, solved, gps=gps)
+        gps = (run.fixes, settings.gps)
+    refined, findings = refine_run(settings.refine, scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
         return replace(found, refined=refined, findings=findings)
-    options: MapConfig = build_config(MapConfig, values.get("map", {}), "map")
-    made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=sensor_reach(values), config=options)
+    reach = sensor_reach(options.as_config())
+    made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=reach, config=settings.map)
     return replace(found, refined=refined, refined_map=made, findings=findings)
+
+
+def _inputs_of(run: Run) -> RunInputs:
+    """The inputs stored in the folder of a run."""
+    assert run.folder is not None
+    inputs, generation = read_consistently(run.folder, read_inputs)
+    check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "inputs.npz", generation))
+    return inputs
 
 
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
     """Back-end options of a run, and a function that makes the GPS, IMU and control inputs of a new graph."""
-    values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
-    gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
-    if gps.use != "none" and run.fixes is None:
+    options = None if run.folder is None else RunOptions.of_folder(run.folder)
+    settings = RunConfig() if options is None else options.settings
+    if settings.gps.use != "none" and run.fixes is None:
         raise MissingDataError(
             f"{run.folder}: the graph of this run has GPS factors, but its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
-    imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")
-    feed: RecordSource | None = None
-    if imu.use != "none" and run.folder is not None:
-        inputs, generation = read_consistently(run.folder, read_inputs)
-        check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "inputs.npz", generation))
-        feed = RecordSource(inputs.log)
-    if run.folder is None and "control_points" in run.report:
+    if options is None and "control_points" in run.report:
         raise MissingDataError("only its folder holds the control points of a run", wanted="a run with out=…")
-    control = None if run.folder is None else RunOptions.of_folder(run.folder).table("control")
+    feed = RecordSource(_inputs_of(run).log) if settings.imu.use != "none" and options is not None else None
+    control = None if options is None else options.table("control")
 
     def streams() -> dict[str, Any]:
-        source = ImuSource(feed, imu) if feed and feed.names(Imu) else None
-        return {"fixes": run.fixes, "gps": gps, "imu": source, "control": control}
+        source = ImuSource(feed, settings.imu) if feed and feed.names(Imu) else None
+        return {"fixes": run.fixes, "gps": settings.gps, "imu": source, "control": control}
 
-    return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
+    return settings.backend, streams
 
 
 def write_minimum_entropy(

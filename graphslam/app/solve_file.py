@@ -17,7 +17,7 @@ from graphslam.solve.network.solve import NetworkSolution, solve_network
 RESIDUAL = "gtsam: Log(z^-1 x_i^-1 x_j)"
 
 
-def solve_network_file(
+def solve_file(
     path: str | os.PathLike[str],
     solver: str = "lm",
     repair: bool = False,
@@ -59,6 +59,21 @@ def solve_network_file(
     dict
         JSON-serialisable. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is that
         of the same solution with g2o's residual.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such solver.
+    MissingDataError, FormatError
+        No such file, or a damaged one.
+    CovarianceError
+        Information matrices of the file are not positive definite; the message names them.
+
+    Examples
+    --------
+    >>> solved = gs.solve_file("runs/field/graph.g2o", "lm")
+    >>> solved["converged"]
+    True
     """
     if out is not None:
         check_file_target(out)

@@ -40,7 +40,7 @@ from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
-__all__ = ["compare", "front_ends", "join_submaps", "joiners", "open_run", "options", "refine_path", "solve_file"]
+__all__ = ["compare", "front_ends", "join_submaps", "joiners", "open_run", "options", "refine_path"]
 __all__ += ["solve_graph", "solvers", "worlds"]
 
 
@@ -345,41 +345,3 @@ def solve_graph(graph: FactorGraph, solver: str = "lm", **options: Any) -> Solut
     with one_blas_thread():
         made.solve_to_optimum()
         return made.solution()
-
-
-def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
-    """Solve a pose-graph file.
-
-    Parameters
-    ----------
-    path : path
-        g2o, TORO or iSAM, detected from the content.
-    solver : str
-        One of :func:`solvers`.
-    **options
-        See :func:`graphslam.app.solve_file.solve_network_file`.
-
-    Returns
-    -------
-    dict
-        ``solver``, ``objective`` (Σ rᵀ Ω r), ``objective_initial``, ``iterations``, ``seconds``, ``converged``,
-        ``gap``.
-
-    Raises
-    ------
-    UnknownNameError
-        There is no such solver.
-    MissingDataError, FormatError
-        No such file, or a damaged one.
-    CovarianceError
-        Information matrices of the file are not positive definite; the message names them.
-
-    Examples
-    --------
-    >>> solved = gs.solve_file("runs/field/graph.g2o", "lm")
-    >>> solved["converged"]
-    True
-    """
-    from graphslam.app import solve_file as solving
-
-    return solving.solve_network_file(path, solver, **options)

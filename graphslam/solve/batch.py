@@ -9,7 +9,6 @@ import numpy as np
 
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import DescentLimits, Optimum, descend_to_minimum
@@ -74,14 +73,6 @@ class BatchSolver:
         self.graph.set_values(optimum.values)
         self.iterations += optimum.iterations
         self.seconds += time.perf_counter() - t0
-
-    def gap(self) -> float:
-        """Current objective minus the batch optimum reached from here."""
-        return linearisation_gap(self.graph)
-
-    def covariance(self) -> JointCovariance:
-        """Joint covariance at the current values."""
-        return self.graph.covariance()
 
     def solution(self, *, gap: bool = True) -> Solution:
         """Solution at the current values; not converged if the graph changed since the last update."""

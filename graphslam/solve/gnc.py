@@ -18,7 +18,6 @@ from scipy.special import gammaincinv
 from graphslam.core.config import check_options
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
-from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import FactorRecord, batch_of
@@ -85,10 +84,6 @@ class GncSolver(BatchSolver):
             self._searched = self.graph.revision
         self.seconds += time.perf_counter() - t0
         self._solve(self.config)
-
-    def covariance(self) -> JointCovariance:
-        """Joint covariance of the remaining graph at the current values."""
-        return self.graph.covariance()
 
     def solution(self, *, gap: bool = True) -> Solution:
         """See :meth:`BatchSolver.solution`; outliers are removed first if the graph changed."""

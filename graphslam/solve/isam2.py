@@ -1,8 +1,8 @@
 """Incremental solver with GTSAM's iSAM2, with convergence diagnostics.
 
 iSAM2 relinearises a variable only if it moved by more than a threshold, so its estimate is partly linearised at old
-values. :meth:`Isam2Solver.gap` is the difference of the objective to the batch optimum reached from here,
-:meth:`Isam2Solver.solve_to_optimum` goes there, and only then a :class:`Solution` is flagged converged.
+values. :func:`~graphslam.solve.batch.linearisation_gap` is the difference of the objective to the batch optimum reached
+from here, :meth:`Isam2Solver.solve_to_optimum` goes there, and only then a :class:`Solution` is flagged converged.
 
 With the datum ``T_gps_world`` as a variable of iSAM2, each GPS fix would change all poses that depend on the datum. So
 iSAM2 has the poses in the GPS frame as soon as the graph has a datum and all factors are relative to it. The first base
@@ -30,7 +30,6 @@ from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.se3 import quat_to_matrix
-from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN, AttitudeRecord
@@ -134,14 +133,6 @@ class Isam2Solver:
         self.graph.set_values(optimum.values)
         self.seconds += time.perf_counter() - t0
 
-    def gap(self) -> float:
-        """Linearisation gap: current objective minus the batch optimum reached from here (nothing is changed)."""
-        return linearisation_gap(self.graph)
-
-    def covariance(self) -> JointCovariance:
-        """Joint covariance, fully linearised at the current values (not at iSAM2's linearisation points)."""
-        return self.graph.covariance()
-
     def solution(self, *, gap: bool = True) -> Solution:
         """Solution at the current values; ``gap=False`` saves the batch solve for the gap."""
         return make_solution(
@@ -149,7 +140,7 @@ class Isam2Solver:
             self.graph,
             state_of(self.graph),
             iterations=self.updates,
-            gap=self.gap() if gap else None,
+            gap=linearisation_gap(self.graph) if gap else None,
             seconds=self.seconds,
         )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.batch import BatchSolver, PcgSolver
 from graphslam.solve.gnc import GncSolver
@@ -24,14 +23,6 @@ class Solver(Protocol):
 
     def solve_to_optimum(self) -> None:
         """Solve to the batch optimum reached from here."""
-        ...
-
-    def gap(self) -> float:
-        """Current objective minus that optimum."""
-        ...
-
-    def covariance(self) -> JointCovariance:
-        """Joint covariance at the current values."""
         ...
 
     def solution(self, *, gap: bool = True) -> Solution:

@@ -92,7 +92,7 @@ def test_isam2_marginals_are_ours_at_the_optimum(rng):
     solver.solve_to_optimum()
     for name in ("x5", "x14", f"l{g.values.landmark_ids[2]}"):
         theirs = solver._isam.marginalCovariance(gtsam_key(name))
-        np.testing.assert_allclose(solver.covariance().marginal(name), theirs, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(solver.graph.covariance().marginal(name), theirs, rtol=1e-6, atol=1e-12)
 
 
 def test_graph_and_chain_solver_agree(rng):

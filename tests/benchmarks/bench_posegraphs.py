@@ -16,7 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from graphslam.app.solve_file import solve_network_file
+from graphslam.app.solve_file import solve_file
 from graphslam.core.errors import GraphSlamError
 from tests.reference.best_known import BEST_KNOWN, SMALL
 
@@ -42,7 +42,7 @@ def main() -> int:
         for solver in solvers:
             cpu = time.process_time()
             try:
-                r = solve_network_file(Path(root) / name, solver)
+                r = solve_file(Path(root) / name, solver)
             except GraphSlamError as error:
                 print(f"{Path(name).name:32} {solver:6} {error}")
                 failed += 1

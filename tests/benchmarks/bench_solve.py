@@ -35,11 +35,11 @@ QUICK = ("smallGrid3D", "kitti_07", "intel")
 
 def ours(path: str) -> dict[str, Any]:
     """Default options, from the file to the report."""
-    from graphslam.app.solve_file import solve_network_file
+    from graphslam.app.solve_file import solve_file
 
     importlib.import_module("graphslam.linear.block_cholesky")  # kernels, which are loaded when they are needed
     begin = time.process_time()
-    report = solve_network_file(path, noise="covariance" if ".txt" in path else "auto")  # as GTSAM reads it
+    report = solve_file(path, noise="covariance" if ".txt" in path else "auto")  # as GTSAM reads it
     return {
         "work": time.process_time() - begin,
         "objective": report["objective"],

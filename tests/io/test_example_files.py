@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from graphslam.app.cli import app
-from graphslam.app.solve_file import solve_network_file
+from graphslam.app.solve_file import solve_file
 
 N = 10
 PAIRS = (*((k, k + 1) for k in range(N - 1)), (0, N - 1), (1, 6), (2, 8))
@@ -247,7 +247,7 @@ def test_a_published_form_reaches_the_optimum_of_gtsam(name: str, tmp_path: Path
     file = tmp_path / "graph.txt"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     best = world.objective()
-    found = solve_network_file(file, **options)
+    found = solve_file(file, **options)
     assert found["converged"]
     assert found["objective"] == pytest.approx(best, rel=1e-6)
     assert best > 1.0
@@ -262,7 +262,7 @@ def test_a_wrong_loop_of_two_robots_is_rejected_as_kimera_rpgo_does(tmp_path: Pa
     w.edges.append((3, 9, wrong, w.edges[0][3]))
     file = tmp_path / "two.g2o"
     file.write_text("\n".join(g2o(w, lambda k: gtsam.symbol("ab"[k >= 5], k))) + "\n")
-    found = solve_network_file(file, solver="gnc")
+    found = solve_file(file, solver="gnc")
     assert found["outlier_names"] == [f"{gtsam.symbol('a', 3)} -> {gtsam.symbol('b', 9)}"]
     assert found["objective_inliers"] == pytest.approx(best, rel=1e-6)
 

@@ -58,6 +58,18 @@ class FactorRecord(Protocol):
         ...
 
 
+class WhitenedRecord:
+    """Base of records with a ``whitener``: one row per component of the residual."""
+
+    __slots__ = ()
+    whitener: Array
+
+    @property
+    def rows(self) -> int:
+        """Dimension of the residual."""
+        return len(self.whitener)
+
+
 def block_offsets(lengths: Sequence[int] | Index) -> Index:
     """``[0, l_0, l_0 + l_1, …]``."""
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)

@@ -12,7 +12,15 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, group_of
-from graphslam.graph.factors.batch import Fixed, Index, UniformBatch, custom_factor, gtsam_pose, with_kernel
+from graphslam.graph.factors.batch import (
+    Fixed,
+    Index,
+    UniformBatch,
+    WhitenedRecord,
+    custom_factor,
+    gtsam_pose,
+    with_kernel,
+)
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import gtsam_key
 
@@ -28,7 +36,7 @@ def between_terms(T_ij: Array, x_i: Array, x_j: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BetweenRecord:
+class BetweenRecord(WhitenedRecord):
     """``T_ij`` between two nodes, right-tangent noise.
 
     Parameters
@@ -45,11 +53,6 @@ class BetweenRecord:
     whitener: Array
     robust: RobustKernel = NO_KERNEL
     group: str = "between"
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.whitener)
 
     def variables(self) -> list[str]:
         """Names of the variables."""

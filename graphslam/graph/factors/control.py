@@ -52,11 +52,6 @@ class ControlRecord(AntennaRecord):
     tilt: bool = False
     group: str = "control"
 
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.z)
-
     def variables(self) -> list[str]:
         """Names of the variables."""
         return [*_names(self.node, self.landmark, self.point), "datum", *(["tilt"] if self.tilt else [])]

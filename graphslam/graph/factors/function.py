@@ -18,6 +18,7 @@ from graphslam.graph.factors.batch import (
     FactorBatch,
     Fixed,
     Index,
+    WhitenedRecord,
     dim_of,
     read_value,
     register_factor,
@@ -34,7 +35,7 @@ STEP = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FunctionRecord:
+class FunctionRecord(WhitenedRecord):
     """One factor of a user.
 
     Parameters
@@ -55,11 +56,6 @@ class FunctionRecord:
     whitener: Array
     robust: RobustKernel = NO_KERNEL
     group: str = "user"
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.whitener)
 
     def variables(self) -> list[str]:
         """Names of the variables."""

@@ -32,12 +32,12 @@ from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import level_poses
 from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, skew, so3_exp
 from graphslam.graph.factors.attitude import up_turn
-from graphslam.graph.factors.batch import Fixed, UniformBatch, custom_factor, with_kernel
+from graphslam.graph.factors.batch import Fixed, UniformBatch, WhitenedRecord, custom_factor, with_kernel
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, whitener
 from graphslam.graph.variables import Values, gtsam_key
 
 
-class AntennaRecord:
+class AntennaRecord(WhitenedRecord):
     """A measured antenna position in the GPS frame: it constrains the datum, and has a field ``tilt``."""
 
     __slots__ = ()
@@ -83,11 +83,6 @@ class GpsRecord(AntennaRecord):
     uneven: bool = False
     point: int | None = None
     stated: Array | None = None
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.z)
 
     def variables(self) -> list[str]:
         """Names of the variables."""

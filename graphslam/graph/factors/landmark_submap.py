@@ -16,20 +16,37 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import FactorBatch, Fixed, Index, block_offsets, safe_factor
+from graphslam.graph.factors.batch import FactorBatch, Fixed, Index, WhitenedRecord, block_offsets, safe_factor
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 
 CONSTANT = ("wheels", "sensor", "mount")
 """Kinds of variables with the constant errors of a robot, two values each."""
 
 
-def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64], robot: int) -> list[str]:
-    marks = [*(f"l{i}" for i in landmark_ids.tolist()), *(f"point{k}" for k in points.tolist())]
-    return marks if robot < 0 else [*marks, *(f"{word}{robot}" for word in CONSTANT)]
+class _BetweenBases(WhitenedRecord):
+    """Base of the records of a submap between x_start and x_{start + 1}."""
+
+    __slots__ = ()
+    start: int
+    landmark_ids: npt.NDArray[np.int64]
+    points: npt.NDArray[np.int64]
+    robot: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
+
+    def entries(self) -> list[str]:
+        """Names of the variables after the two poses, in the order of z."""
+        names = [*(f"l{i}" for i in self.landmark_ids.tolist()), *(f"point{k}" for k in self.points.tolist())]
+        return names if self.robot < 0 else [*names, *(f"{word}{self.robot}" for word in CONSTANT)]
+
+    def variables(self) -> list[str]:
+        """Names of the free and fixed variables, each once."""
+        return [f"x{self.start}", f"x{self.start + 1}", *dict.fromkeys(self.entries())]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SubmapRecord:
+class SubmapRecord(_BetweenBases):
     """A landmark submap between x_start and x_{start + 1} (Combined SLAM eq. 15).
 
     Parameters
@@ -59,18 +76,10 @@ class SubmapRecord:
     robot: int = -1
     information: Array = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
-
     @property
-    def points(self) -> npt.NDArray[np.int64]:
+    def points(self) -> npt.NDArray[np.int64]:  # type: ignore[override]
         """Rows of points of the path: empty here."""
         return np.zeros(0, dtype=np.int64)
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.whitener)
 
     @property
     def own(self) -> tuple[Array, Array]:
@@ -82,21 +91,13 @@ class SubmapRecord:
         """Positions ``(n, 2)`` of the landmarks in the frame of the base."""
         return self.z[3 : 3 + 2 * len(self.landmark_ids)].reshape(-1, 2)
 
-    def entries(self) -> list[str]:
-        """Names of the variables after the two poses, in the order of z."""
-        return _entries(self.landmark_ids, self.points, self.robot)
-
-    def variables(self) -> list[str]:
-        """Names of the free and fixed variables, each once."""
-        return [f"x{self.start}", f"x{self.start + 1}", *dict.fromkeys(self.entries())]
-
     def label(self) -> str:
         """Name for messages."""
         return f"submap {self.submap_key} (factor {self.factor_id})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PathRecord:
+class PathRecord(_BetweenBases):
     """Points of the path inside a landmark submap, conditioned on its end pose and landmarks.
 
     The joint Gaussian of end pose, landmarks and points is the product of that of end pose and landmarks (the submap's
@@ -126,22 +127,6 @@ class PathRecord:
     group: str = "path"
     robot: int = -1
     information: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "information", (self.whitener.T @ self.whitener).ravel())
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.whitener)
-
-    def entries(self) -> list[str]:
-        """Names of the variables after the two poses, in the order of z."""
-        return _entries(self.landmark_ids, self.points, self.robot)
-
-    def variables(self) -> list[str]:
-        """Names of the free and fixed variables, each once."""
-        return [f"x{self.start}", f"x{self.start + 1}", *dict.fromkeys(self.entries())]
 
     def label(self) -> str:
         """Name for messages."""

@@ -10,14 +10,22 @@ import gtsam
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import Fixed, Index, UniformBatch, custom_factor, register_factor, with_kernel
+from graphslam.graph.factors.batch import (
+    Fixed,
+    Index,
+    UniformBatch,
+    WhitenedRecord,
+    custom_factor,
+    register_factor,
+    with_kernel,
+)
 from graphslam.graph.factors.range import antennas
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableLayout, gtsam_key
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PositionRecord:
+class PositionRecord(WhitenedRecord):
     """Position of a node, without its rotation.
 
     Parameters
@@ -34,11 +42,6 @@ class PositionRecord:
     whitener: Array
     robust: RobustKernel = NO_KERNEL
     group: str = "position"
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.z)
 
     def variables(self) -> list[str]:
         """Names of the variables."""

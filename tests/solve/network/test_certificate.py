@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.solve_file import solve_network_file
+from graphslam.app.solve_file import solve_file
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import network_values, problem_of_network
@@ -135,11 +135,11 @@ def test_what_cannot_be_judged_says_why(rng: np.random.Generator) -> None:
 def test_report_holds_the_certificate_only_if_asked(rng: np.random.Generator, tmp_path: Path) -> None:
     net, _, _ = random_network(rng, 2, noise=0.01)
     write_g2o(tmp_path / "a.g2o", net)
-    assert "certificate" not in solve_network_file(tmp_path / "a.g2o")
-    report = solve_network_file(tmp_path / "a.g2o", certificate=True)
+    assert "certificate" not in solve_file(tmp_path / "a.g2o")
+    report = solve_file(tmp_path / "a.g2o", certificate=True)
     assert report["certificate"] == "certified"
     assert report["certificate_numbers"]["verdict"] == "certified"
-    assert "certificate" in solve_network_file(tmp_path / "a.g2o", "gnc", certificate=True)
+    assert "certificate" in solve_file(tmp_path / "a.g2o", "gnc", certificate=True)
 
 
 @pytest.mark.data

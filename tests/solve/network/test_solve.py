@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.solve_file import solve_network_file
+from graphslam.app.solve_file import solve_file
 from graphslam.core.errors import (
     ConfigError,
     CovarianceError,
@@ -39,7 +39,7 @@ AGREE = 1e-7
 @pytest.mark.parametrize("solver", ["lm", "isam2", "pcg"])
 @pytest.mark.parametrize("name", SMALL)
 def test_small_files_reach_the_best_known_objective(data_dir: Path, name: str, solver: str) -> None:
-    report = solve_network_file(data_dir / name, solver)
+    report = solve_file(data_dir / name, solver)
     assert report["objective"] == pytest.approx(BEST_KNOWN[name], rel=AGREE)
     assert report["converged"]
     assert report["gap"] <= AGREE * report["objective"]
@@ -241,7 +241,7 @@ def test_undetermined_networks_are_named(rng: np.random.Generator, tmp_path: Pat
     write_g2o(tmp_path / "two.g2o", broken)
     for solver in SOLVERS:
         with pytest.raises(IndeterminateError) as caught:
-            solve_network_file(tmp_path / "two.g2o", solver)
+            solve_file(tmp_path / "two.g2o", solver)
         # vertex 13 has no edge, 14 to 16 are an island
         assert caught.value.variables == ("vertex 13", "vertex 14", "vertex 15", "vertex 16")
         assert "needs an edge to the rest, or a FIX" in str(caught.value)
@@ -255,7 +255,7 @@ def test_landmark_never_seen_is_named(tmp_path: Path) -> None:
     path = tmp_path / "m.g2o"
     path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_XY 9 1 1\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     with pytest.raises(IndeterminateError, match="landmark 9 is not connected"):
-        solve_network_file(path)
+        solve_file(path)
 
 
 def test_unknown_names_and_options_are_refused(rng: np.random.Generator) -> None:
@@ -282,8 +282,8 @@ def test_solve_file_repairs_on_request_counts_and_writes(rng: np.random.Generato
     bad = tmp_path / "bad.g2o"
     bad.write_text("\n".join(lines))
     with pytest.raises(CovarianceError, match=r"indefinite: 9 -> 10"):
-        solve_network_file(bad)
-    report = solve_network_file(bad, repair=True, out=tmp_path / "out.g2o.xz")
+        solve_file(bad)
+    report = solve_file(bad, repair=True, out=tmp_path / "out.g2o.xz")
     assert report["repaired"] == 1
     assert report["converged"]
     back = read_g2o(tmp_path / "out.g2o.xz")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from graphslam.core.geometry import Array
+from graphslam.graph.factors.batch import WhitenedRecord
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImuRecord:
+class ImuRecord(WhitenedRecord):
     """The preintegrated measurement from node i to node j.
 
     Parameters
@@ -61,11 +62,6 @@ class ImuRecord:
     def seconds(self) -> float:
         """T."""
         return self.interval[1] - self.interval[0]
-
-    @property
-    def rows(self) -> int:
-        """Dimension of the residual."""
-        return len(self.whitener)
 
     def variables(self) -> list[str]:
         """Names of the variables."""
