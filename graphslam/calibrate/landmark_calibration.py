@@ -66,7 +66,7 @@ def calibrate_observations(
     noise : MotionNoise, optional
         Noise of controls without a calibration, for comparison.
     """
-    held, noise = seen.holding(), noise or MotionNoise()
+    held, noise = seen.with_withheld(), noise or MotionNoise()
     blind = not np.any(seen.detections.has_bearing)
     if blind:
         found, whole = _ranges_alone(held, effort, seed)
@@ -173,7 +173,7 @@ def _without_slips(
 def _again(seen: ObservationLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
     """The calibration repeated with the corrected clock of the motion."""
     found = _range_and_bearing(
-        seen.mended(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
+        seen.corrected(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
     )
     if found.contradictions():
         return found

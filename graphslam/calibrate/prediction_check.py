@@ -61,7 +61,7 @@ def predict_withheld_observations(
         """Negative log-likelihood of the withheld observations [nats], and their number; the first call trims."""
         nonlocal kept
         own = _sigmas(c, stated)
-        s = _smoothing(seen.mended(c), scans, start, visits=own["visit_range"] > 0.0)
+        s = _smoothing(seen.corrected(c), scans, start, visits=own["visit_range"] > 0.0)
         if kept is None:
             s.sigmas |= {k: max(own[k], stated[k]) for k in ("range", "bearing")}
             s.converge(ITERATIONS)

@@ -423,10 +423,6 @@ def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
     raw = _gated("distance_scale", full, parts, 0, gain)
     # (odometry - match) / match is the factor minus 1
     value = math.log1p(max(raw.value, -0.9))
-    scale = Estimate(
-        **{k: getattr(raw, k) for k in raw.__dataclass_fields__ if k not in ("value", "other")},
-        value=value,
-        other=math.log1p(max(raw.other, -0.9)),
-    )
+    scale = replace(raw, value=value, other=math.log1p(max(raw.other, -0.9)))
     side = regress_errors(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
     return scale, {"along_metre": float(full.sigmas[1]), "lateral_metre": float(side.sigmas[1])}

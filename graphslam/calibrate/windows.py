@@ -62,12 +62,12 @@ class ObservationLog:
         _, motion = motion_stream(log)
         return cls(log, name, detections, cumulative_motion(motion))
 
-    def mended(self, c: Corrections) -> ObservationLog:
+    def corrected(self, c: Corrections) -> ObservationLog:
         """Copy with corrections applied; the same observations are withheld."""
         made = ObservationLog.of(apply_corrections(self.log, c), self.name, corrected_observations(self.detections, c))
         return replace(made, withheld=self.withheld, stated=self.stated)
 
-    def holding(self) -> ObservationLog:
+    def with_withheld(self) -> ObservationLog:
         """Copy with some observations withheld: the last :data:`HELD` of every :data:`EVERY` seconds."""
         s = self.detections
         times = np.repeat(s.times, np.diff(s.offsets))

@@ -107,6 +107,7 @@ def overlap_probability(T: Array, P: Array, config: CandidateConfig) -> tuple[Ar
 
     Horizontally by the distance and the larger horizontal σ, in the axes of the first place; vertically by the
     height difference.
+
     Parameters
     ----------
     T : (k, 7) or (k, 3)

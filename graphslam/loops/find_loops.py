@@ -20,7 +20,7 @@ from graphslam.loops.candidates import (
     pairs_sharing_scans,
     proximity_in_slices,
 )
-from graphslam.loops.graph_loops import GraphLoops, GraphSolver, chain_of_graph
+from graphslam.loops.graph_loops import GraphLoops, chain_of_graph
 from graphslam.loops.loops import LoopCloser, LoopConfig
 from graphslam.loops.measure import LoopMeasurer
 from graphslam.loops.overlap_constraints import Entry, OverlapConfig, overlap_candidates, overlap_entries
@@ -28,6 +28,7 @@ from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.place_descriptor import DescriptorConfig, concatenate_descriptors, describe_places
 from graphslam.registration.search import last_value
+from graphslam.solve.registry import Solver
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ class FindConfig:
 
 def find_loops(
     graph: FactorGraph,
-    solver: GraphSolver,
+    solver: Solver,
     submaps: Sequence[Submap],
     config: FindConfig | None = None,
     *,
@@ -72,7 +73,7 @@ def find_loops(
     ----------
     graph : FactorGraph
         Of one chain of dense submaps, solved.
-    solver : GraphSolver
+    solver : Solver
         Of that graph.
     submaps : sequence of Submap
         Those of the graph in their order, with dense maps.
@@ -119,7 +120,7 @@ class LoopSearch:
     def look_in_slices(
         self,
         graph: FactorGraph,
-        solver: GraphSolver,
+        solver: Solver,
         submaps: Sequence[Submap],
         *,
         last: bool = False,

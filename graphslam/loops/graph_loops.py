@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from graphslam.core.errors import DataError
@@ -18,15 +16,10 @@ from graphslam.graph.relative import relative_poses
 from graphslam.loops.candidates import OVERLAP
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
+from graphslam.solve.registry import Solver
 
 GROUP = "loop"
 """Factor class of loops in the graph's objective."""
-
-
-class GraphSolver(Protocol):
-    """A solver of a pose graph."""
-
-    def solve_to_optimum(self) -> None: ...
 
 
 def places_of_graph(graph: FactorGraph) -> Places:
@@ -37,7 +30,7 @@ def places_of_graph(graph: FactorGraph) -> Places:
         wanted = 0 if k == 0 else graph.submaps[k - 1].exit_node
         if not s.nodes or s.nodes != tuple(range(wanted, wanted + len(s.nodes))):
             raise DataError(
-                f"submap {s.key} does not go on where the one before ended: loops need one chain of submaps",
+                f"submap {s.key} does not start where the previous one ended: loops need one chain of submaps",
                 got=s.nodes[:1],
                 wanted=wanted,
             )
@@ -73,11 +66,11 @@ class GraphLoops:
     ----------
     graph : FactorGraph
         Of one chain of dense submaps; may also have GPS and attitude factors.
-    solver : GraphSolver
+    solver : Solver
         Of that graph.
     """
 
-    def __init__(self, graph: FactorGraph, solver: GraphSolver) -> None:
+    def __init__(self, graph: FactorGraph, solver: Solver) -> None:
         self.graph, self.solver = graph, solver
         self.places = places_of_graph(graph)
 

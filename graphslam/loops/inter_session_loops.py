@@ -269,7 +269,7 @@ class TwoSessions:
         if n < config.least:
             why = f"{counts}, wanted {config.least}"
         elif reach < config.reach:
-            why = f"{counts}, but over {reach:.1f} m of the way only, wanted {config.reach:g} m"
+            why = f"{counts}, but over {reach:.1f} m of the path only, wanted {config.reach:g} m"
         elif rival > config.rival * n:
             why = f"{counts}, but {rival} others agree on another pose: this could be two places"
         own = [replace(x, j=x.j - self.offset) for x in loops]

@@ -68,7 +68,7 @@ def test_clocks_that_agree_are_left_alone(number: int, rate: float, scans: float
     """Records that are averaged over half a period look less noisy, whatever the clocks are."""
     robot = dataclasses.replace(draw_robot(number), clock=0.0)
     drawn = drive(robot, number, 90.0, rate=rate, scans=scans)
-    seen = ObservationLog.of(drawn, "landmarks", drawn["landmarks"]).holding()
+    seen = ObservationLog.of(drawn, "landmarks", drawn["landmarks"]).with_withheld()
     free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
     clock = profile_clock(fit_noise(smooth_observations(seen, SHORT, 20, free))[0], seen)
     assert not clock.applied
@@ -78,7 +78,7 @@ def test_clocks_that_agree_are_left_alone(number: int, rate: float, scans: float
 def test_withheld_observations_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
     assert found.prediction.supported == "all"
     assert found.prediction.gains["all"] > 100.0
-    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).holding()
+    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).with_withheld()
     share = float(seen.withheld.mean())
     assert 0.0 < share < 0.2
     scans = window_scans(seen, LONG)
@@ -95,7 +95,7 @@ def test_withheld_observations_take_what_is_right_and_refuse_what_is_wrong(log, 
 
 
 def test_corrections_that_change_nothing_predict_nothing_better(log, found) -> None:
-    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).holding()
+    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).with_withheld()
     none = dataclasses.replace(found, corrections=Corrections())
     gains = predict_withheld_observations(seen, none, window_scans(seen, LONG), MotionNoise()).gains
     assert gains["all"] == pytest.approx(0.0, abs=0.01)

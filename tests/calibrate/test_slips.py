@@ -104,7 +104,7 @@ def test_wheels_that_are_half_a_second_late_are_found_beyond_minima_of_chance() 
     drawn = world_log(world, SeedTree(12))
     o = drawn["odometry"]
     late = replace(drawn, streams={**drawn.streams, "odometry": replace(o, times=o.times + 0.5)})
-    seen = seen_in(late).holding()
+    seen = seen_in(late).with_withheld()
     clock = profile_clock(fit_noise(smooth_observations(seen, SHORT, 5, FREE))[0], seen)
     assert clock.applied
     assert clock.sigma < 0.1

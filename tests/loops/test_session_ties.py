@@ -119,7 +119,7 @@ def test_agreement_decides_and_two_places_are_not_guessed_between(two: TwoSessio
     few = two.agree(right[:2], CONFIG)
     assert "2 agree, wanted 3" in few.why
     near = made(two, true, [(1, 2), (2, 3), (3, 2)], rng)
-    assert "m of the way only" in two.agree(near, CONFIG).why
+    assert "m of the path only" in two.agree(near, CONFIG).why
     assert "0 agree" in two.agree([], CONFIG).why
 
 

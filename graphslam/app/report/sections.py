@@ -65,7 +65,7 @@ def what_was_run(folder: ReportFolder) -> Markup:
     versions = folder.part("versions")
     parts.append(pair_list(versions) if versions else missing_note("versions; ", _why(folder, "run.json")))
     if folder.config:
-        parts.append(folded_section("All options (config.toml)", html_element("pre", _toml(folder.config))))
+        parts.append(folded_section("All options (config.toml)", html_element("pre", dump_toml(folder.config))))
     else:
         parts.append(missing_note("options; ", _why(folder, "config.toml")))
     if folder.part("source_meta"):
@@ -309,10 +309,6 @@ def problems_section(folder: ReportFolder) -> Markup:
 
 def _why(folder: ReportFolder, name: str) -> str:
     return f"{name} {folder.problems.get(name, 'has no entry')}."
-
-
-def _toml(config: Mapping[str, Any]) -> str:
-    return dump_toml(config)
 
 
 def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:

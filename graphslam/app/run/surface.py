@@ -15,7 +15,7 @@ from graphslam.app.folders.generations import current_outputs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.layer import Layer
 from graphslam.app.run.run import Run
-from graphslam.app.run.terrain import read_terrain_file, scans_of_run
+from graphslam.app.run.terrain import ScannedPath, read_terrain_file, scans_of_run
 from graphslam.core import se3
 from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
@@ -34,44 +34,6 @@ FORMAT = "graphslam.surface/1"
 COLOURS = ("height", "piece", "session", "sigma", "terrain")
 """Colours of a surface: height, node that the vertex is attached to, session of that node, σ of the position due to
 the node's pose, or terrain class below the vertex."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScannedPath:
-    """Scans along a solved path.
-
-    Parameters
-    ----------
-    path : Trajectory
-        ``T_world_base``, 3-D.
-    node_times, node_poses : (k,), (k, 7)
-        In time order; a scan is attached to the last node before it.
-    node_covariances : (k, 6, 6), optional
-        In the right tangent of each node.
-    """
-
-    scans: PointClouds | RangeScans
-    path: Trajectory
-    node_times: Array
-    node_poses: Array
-    node_covariances: Array | None = None
-    stream: str = "scans"
-
-    def inside(self) -> npt.NDArray[np.int64]:
-        """Indices of the scans within the time of the path."""
-        times = self.scans.times
-        inside = (times >= self.path.times[0]) & (times <= self.path.times[-1])
-        if isinstance(self.scans, RangeScans):
-            inside &= times + self.scans.beam_times.max() <= self.path.times[-1]
-        at = np.flatnonzero(inside)
-        if not len(at):
-            raise DataError("no scan lies within the solved path in time", where=self.stream)
-        return at
-
-    def nodes_of(self, at: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Index of the node that each of these scans is attached to."""
-        node = np.searchsorted(self.node_times, self.scans.times[at], side="right") - 1
-        return np.clip(node, 0, len(self.node_poses) - 1)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,44 @@ _AROUND, _LOOK = 6, 3
 """The scanner height is the median over every third scan up to 6 scans before and after."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScannedPath:
+    """Scans along a solved path.
+
+    Parameters
+    ----------
+    path : Trajectory
+        ``T_world_base``, 3-D.
+    node_times, node_poses : (k,), (k, 7)
+        In time order; a scan is attached to the last node before it.
+    node_covariances : (k, 6, 6), optional
+        In the right tangent of each node.
+    """
+
+    scans: PointClouds | RangeScans
+    path: Trajectory
+    node_times: Array
+    node_poses: Array
+    node_covariances: Array | None = None
+    stream: str = "scans"
+
+    def inside(self) -> Ints:
+        """Indices of the scans within the time of the path."""
+        times = self.scans.times
+        inside = (times >= self.path.times[0]) & (times <= self.path.times[-1])
+        if isinstance(self.scans, RangeScans):  # beams are measured after the time stamp of their line
+            inside &= times + self.scans.beam_times.max() <= self.path.times[-1]
+        at = np.flatnonzero(inside)
+        if not len(at):
+            raise DataError("no scan lies within the solved path in time", where=self.stream)
+        return at
+
+    def nodes_of(self, at: Ints) -> Ints:
+        """Index of the node that each of these scans is attached to."""
+        node = np.searchsorted(self.node_times, self.scans.times[at], side="right") - 1
+        return np.clip(node, 0, len(self.node_poses) - 1)
+
+
 @dataclass(frozen=True)
 class RunTerrain:
     """Result of :func:`read_terrain`.
@@ -184,12 +222,8 @@ def read_terrain(
         Name of the scans; see :class:`Terrain`; show a progress bar.
     """
     path, node_times, node_poses = solved.trajectory, solved.node_times, solved.node_poses
-    inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
-    if isinstance(scans, RangeScans):  # beams are measured after the time stamp of their line
-        inside &= scans.times + scans.beam_times.max() <= path.times[-1]
-    at: Ints = np.flatnonzero(inside).astype(np.int64)
-    if not len(at):
-        raise DataError("no scan lies within the solved path in time", where=stream)
+    scanned = ScannedPath(scans=scans, path=path, node_times=node_times, node_poses=node_poses, stream=stream)
+    at = scanned.inside()
     if isinstance(scans, PointClouds):
         rotation, height, step = _ground_of_clouds(scans, at, path, sensor_height)
     else:
@@ -202,7 +236,7 @@ def read_terrain(
     turn = np.concatenate([np.zeros(3), se3.matrix_to_quat(rotation)])
     level = Trajectory(path.times, se3.se3_compose(np.broadcast_to(turn, path.poses.shape), path.poses))
     poses = se3.se3_compose(np.broadcast_to(turn, node_poses.shape), node_poses)
-    owner = np.clip(np.searchsorted(node_times, scans.times[at], side="right") - 1, 0, len(poses) - 1)
+    owner = scanned.nodes_of(at)
     begin, count = time.process_time(), 0
     nodes = np.unique(owner)
     turns = None
