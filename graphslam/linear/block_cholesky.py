@@ -114,11 +114,15 @@ class BlockFactor:
         out[s.permutation] = x
         return out
 
-    def inverse_block(self, indices: npt.ArrayLike) -> Array:
-        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, without the whole inverse (Algorithm 1)."""
+    def inverse_block(self, indices: npt.ArrayLike, J: Array | None = None) -> Array:
+        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, without the whole inverse (Algorithm 1).
+
+        With ``J (k, m)`` ``Jᵀ B J`` of that block B, for the work of m columns.
+        """
         s = self._symbolic
         unit = s._place[np.asarray(indices, dtype=np.intp)]
-        W, _ = solving.solve_lower_units(*s._solve, s._parent, s._panel_ptr, self._L, unit)
+        J = np.eye(len(unit)) if J is None else np.ascontiguousarray(J)
+        W, _ = solving.solve_lower_units(*s._solve, s._parent, s._panel_ptr, self._L, unit, J)
         return np.asarray(W.T @ W)
 
     def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:

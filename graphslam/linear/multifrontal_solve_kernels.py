@@ -46,13 +46,13 @@ def solve_upper(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array
 
 @njit(nogil=True, fastmath={"contract"})
 def solve_lower_units(
-    own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
+    own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index, J: Array
 ) -> tuple[Array, Index]:
-    """``L⁻¹ E`` for unit columns ``unit`` ``(k,)``: its nonzero rows, and their indices.
+    """``L⁻¹ E J`` for unit columns E at ``unit`` ``(m,)`` and ``J (m, k)``: its nonzero rows, and their indices.
 
     Only the supernodes from a unit's own to the root are visited.
     """
-    S, k = len(own) - 1, len(unit)
+    S, k = len(own) - 1, J.shape[1]
     visited = np.zeros(S, np.bool_)
     count = 0
     for u in unit:
@@ -71,8 +71,8 @@ def solve_lower_units(
                 which[n] = c
                 n += 1
     W = np.zeros((count, k))
-    for j in range(k):
-        W[place[unit[j]], j] = 1.0
+    for j in range(len(unit)):
+        W[place[unit[j]]] += J[j]
     for s in range(S):
         if not visited[s]:
             continue

@@ -139,13 +139,13 @@ def _relative(refinement: Refinement, a: int, b: int) -> Array:
     g = group_of(refinement.poses)
     knots = np.unique(np.linspace(a, b, min(KNOTS, b - a + 1)).round().astype(np.int64))
     d = g.dof
-    P = refinement.joint(knots)
-    out = np.zeros((len(knots), d, d))
-    for i, k in enumerate(knots[1:], start=1):
-        A = -g.adjoint(g.between(refinement.poses[k], refinement.poses[a]))
-        J = np.concatenate([A, np.eye(d)], axis=1)
-        rows = np.concatenate([np.arange(d), i * d + np.arange(d)])
-        out[i] = J @ P[np.ix_(rows, rows)] @ J.T
+    n = len(knots)
+    J = np.zeros((n, d, n, d))  # joint steps → relative ones
+    J[0] = -np.transpose(g.adjoint(g.between(refinement.poses[knots], refinement.poses[a])), (2, 0, 1))
+    J[range(n), :, range(n)] += np.eye(d)
+    P = refinement.joint(knots, J[:, :, 1:].reshape(n * d, -1)).reshape(n - 1, d, n - 1, d)
+    out = np.zeros((n, d, d))
+    out[1:] = P[range(n - 1), :, range(n - 1)]
     steps = np.arange(a, b + 1)
     j = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, max(len(knots) - 2, 0))
     if len(knots) == 1:

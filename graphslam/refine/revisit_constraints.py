@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
@@ -31,6 +32,8 @@ FAR = 1.0, 0.1
 """A guide with a larger difference to the refined path is a wrong loop of the initial path [m], [rad]."""
 ACCEPTED = 16.8
 """χ² of six degrees of freedom at 99 %: above it a guide contradicts the scans in between."""
+TOGETHER = 8
+"""Guides whose covariances are computed in one pass over the factor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +89,14 @@ class RevisitConstraints:
         e = g.log(g.between(self.poses, step))
         A = -g.adjoint(g.inverse(step))
         own = np.diag(_sigmas(g) ** 2)
-        out = np.empty(len(self))
-        for k, (a, b) in enumerate(self.steps.tolist()):
-            rows = np.concatenate([a * width + np.arange(width), b * width + np.arange(width)])
-            C = solved.factor.inverse_block(rows)
-            J = np.concatenate([A[k], np.eye(width)], axis=1)
-            out[k] = e[k] @ np.linalg.solve(DOUBT * J @ C @ J.T + own, e[k])
+        out, rows = np.empty(len(self)), (self.steps[:, :, None] * width + np.arange(width)).reshape(-1, 2 * width)
+        for first in range(0, len(self), TOGETHER):
+            some = range(first, min(first + TOGETHER, len(self)))
+            # Jᵀ of each guide on the diagonal
+            J = block_diag(*(np.concatenate([A[k], np.eye(width)], axis=1).T for k in some))
+            C = solved.factor.inverse_block(rows[some].ravel(), J).reshape(len(some), width, len(some), width)
+            for i, k in enumerate(some):
+                out[k] = e[k] @ np.linalg.solve(DOUBT * C[i, :, i] + own, e[k])
         return out
 
 

@@ -89,6 +89,9 @@ def test_solutions_and_inverse_blocks(
     np.testing.assert_allclose(factor.solve(b), inverse @ b, rtol=0, atol=1e-12)
     some = rng.permutation(len(b))[: min(len(b), 9)]
     np.testing.assert_allclose(factor.inverse_block(some), inverse[np.ix_(some, some)], rtol=0, atol=1e-12)
+    J = rng.standard_normal((len(some), 4))
+    expected = J.T @ inverse[np.ix_(some, some)] @ J
+    np.testing.assert_allclose(factor.inverse_block(some, J), expected, rtol=0, atol=1e-12)
     for w in (1, 2, 3):
         at = rng.permutation(A.at[A.width == w])
         expected = np.array([inverse[i : i + w, i : i + w] for i in at]).reshape(-1, w, w)

@@ -11,6 +11,7 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.records import LaserScans, Odometry
+from graphslam.refine import revisit_constraints
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import refine_by_scans
 from graphslam.refine.scans import Scans
@@ -189,3 +190,22 @@ def test_scans_that_mended_the_odometry_are_not_in_its_sigma() -> None:
     np.testing.assert_array_equal(mine, mended.recorded.covariances)
     np.testing.assert_allclose(mine, Scans.of(plain).odometry.covariances, rtol=1e-9)
     assert np.median(mended.odometry.covariances[1:, 2, 2] / mine[1:, 2, 2]) < 0.9
+
+
+def test_combinations_of_the_joint_covariance_are_those_of_the_whole(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of steps between nodes; and guides together and one by one have the same distances."""
+    found = refined()[0]
+    steps = np.sort(rng.choice(len(found.poses), 6, replace=False))
+    J = rng.standard_normal((18, 4))
+    whole = found.joint(steps)
+    np.testing.assert_allclose(found.joint(steps, J), J.T @ whole @ J, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(whole[3:6, 3:6], found.joint(steps[1:2]), rtol=1e-9, atol=1e-15)
+    path = found.poses[found.nodes]
+    pairs = rng.integers(0, len(path), (20, 2))
+    near = SE2.compose(SE2.between(path[pairs[:, 0]], path[pairs[:, 1]]), SE2.exp(0.1 * rng.standard_normal((20, 3))))
+    guides = revisit_constraints.RevisitConstraints(pairs[pairs[:, 0] != pairs[:, 1]], near[pairs[:, 0] != pairs[:, 1]])
+    together = guides.distances(path, found.solved, 3)
+    monkeypatch.setattr(revisit_constraints, "TOGETHER", 1)
+    np.testing.assert_allclose(guides.distances(path, found.solved, 3), together, rtol=1e-9)
