@@ -10,6 +10,7 @@ are where the closure puts them, not where the long path would, whichever of two
 from __future__ import annotations
 
 import math
+from bisect import bisect_right, insort
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
@@ -291,11 +292,13 @@ class _GrowingSample:
         self.frames = _Upright(segmap, root) if segmap.group.dim == 2 or segmap.gravity else _Free(segmap, root)
         self.segments, self.via, self.depth = [root.segment], [-1], [0]
         self.intervals, self.anchor, self.travelled = [(root.start, root.end)], [root.anchor], [0.0]
+        self.starts, self.ends = [root.start], [root.end]  # of the intervals, ascending
         self.drawn: dict[tuple[int, int], int] = {}
 
     def free(self, begin: int, end: int) -> bool:
         """Is an interval without overlap with the sample?"""
-        return not any(begin < e and s < end for s, e in self.intervals)
+        first = bisect_right(self.ends, begin)  # they do not overlap each other
+        return first == len(self.ends) or self.starts[first] >= end
 
     def fits(self, found: Ints) -> Ints:
         """Those without overlap in time with the sample."""
@@ -313,6 +316,8 @@ class _GrowingSample:
         self.via.append(at)
         self.depth.append(self.depth[at] + 1)
         self.intervals.append((int(self.t.start[index]), int(self.t.end[index])))
+        insort(self.starts, self.intervals[-1][0])
+        insort(self.ends, self.intervals[-1][1])
         self.anchor.append(step_there)
         self.travelled.append(self.travelled[at] + float(abs(L[step_here] - L[self.anchor[at]])))
         return len(self.segments) - 1

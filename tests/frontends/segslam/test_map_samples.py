@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import Counter
 from fractions import Fraction
 
@@ -16,7 +17,9 @@ from graphslam.core.poses import frame_between, remove_roll_pitch
 from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.sampling import (
     OPEN,
+    SampleRoot,
     _draw,
+    _GrowingSample,
     draw_weights,
     grow_sample,
     nearest_step,
@@ -457,3 +460,22 @@ def test_a_sample_has_a_seam_where_its_fronts_met() -> None:
     assert len(seen) > 2
     assert places == {4, 6}  # on either side of where the fronts meet
     assert find_seams(m, grow_sample(m, root_of_segment(m, 6), np.random.default_rng(0))) == []
+
+
+def test_free_intervals_are_those_that_overlap_none(rng: np.random.Generator) -> None:
+    """Intervals in ascending lists against each with each; also touching ones, and an open root of no length."""
+    m = square()
+    for _ in range(50):
+        at = int(rng.integers(0, 30))
+        entry = m.group.identity
+        root = SampleRoot(segment=OPEN, start=at, end=at, anchor=at, entry=entry, exit=None, source=-1)
+        growing = _GrowingSample(m, root, lambda _: 0, 0.0, 0)
+        kept = [(at, at)]
+        for begin, length in zip(rng.integers(0, 30, 40).tolist(), rng.integers(1, 6, 40).tolist()):
+            end = begin + length
+            free = growing.free(begin, end)
+            assert free == (not any(begin < e and s < end for s, e in kept))
+            if free:
+                kept.append((begin, end))
+                insort(growing.starts, begin)
+                insort(growing.ends, end)
