@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +39,8 @@ KEY = (0.4, 0.3)
 """A scan farther than this from the last key scan, in metres driven or angle turned, is a key scan [m, rad]."""
 APART = {2: (1, 3), 3: (1, 3, 8)}
 """Differences of key-scan index in a pair, by dimension."""
+TURN = 0.1
+"""Smaller turns tell nothing about their scale: their errors would give one [rad]."""
 HELD = (0.06, 0.03)
 """A match with a larger σ in its weakest direction [m] or in heading [rad] is rejected, as in corridors."""
 BLOCK = 10
@@ -73,8 +76,10 @@ class ScanPairs:
     ----------
     apart : (n,)
         Difference of their key-scan indices.
-    seconds, metres, turn : (n,)
-        Time in motion, distance and signed angle of the odometry between them; ``turned``: sum of absolute angles.
+    seconds, metres : (n,)
+        Time in motion and distance of the odometry between them.
+    turn, turned : (n,)
+        Angle of the match: signed, 0 below :data:`TURN`, and absolute [rad].
     chord : (n,)
         Translation of the match, projected onto the direction of the odometry displacement [m].
     stated_heading, stated_along : (n,)
@@ -107,9 +112,8 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     """Matched pairs of key scans spread over the log, at most ``most`` for each index difference."""
     o = steps.odometry
     g = group_of(o.increments)
-    d = np.linalg.norm(g.log(o.increments)[:, g.position], axis=1)
     xi = g.log(o.increments)
-    turns = xi[:, g.heading]
+    d, turns = np.linalg.norm(xi[:, g.position], axis=1), xi[:, g.heading]
     seen = np.diff(steps.offsets) >= LEAST_POINTS
     keys, length, turned = [], np.inf, np.inf
     for k in range(len(steps)):
@@ -120,7 +124,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     dt = np.concatenate([[0.0], np.diff(steps.times)])[: len(steps)]
     moving = (d > 0.005 * np.maximum(dt, 1e-9)) | (np.abs(turns) > 0.005 * np.maximum(dt, 1e-9))
     variances = np.diagonal(o.covariances, axis1=1, axis2=2)
-    growing = (dt * moving, d, turns, np.abs(turns), variances[:, g.heading], variances[:, g.position].mean(axis=1))
+    growing = (dt * moving, d, variances[:, g.heading], variances[:, g.position].mean(axis=1))
     sums = [np.cumsum(v) for v in growing]
     targets: dict[int, Target] = {}
     rows, tried = [], 0
@@ -147,15 +151,16 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
                 continue
             e = g.log(g.between(found.T_target_source, T))
             direction = np.asarray(T[: steps.dim]) / max(float(np.linalg.norm(T[: steps.dim])), 1e-9)
-            start = g.log(T)[g.position]
+            start, shift = g.log(T)[g.position], e[g.position]
             start = start / max(float(np.linalg.norm(start)), 1e-9)
-            shift = e[g.position]
             along = float(shift @ start)
             side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
-            # translation of the match, not of the odometry: noise in the regressor would bias the scale
+            # translation and turn of the match, not of the odometry: noise in the regressor would bias the scale
             chord = float(np.asarray(found.T_target_source[: steps.dim]) @ direction)
-            motion = [float(s[b] - s[a]) for s in sums]
-            rows.append([apart, *motion, chord, float(e[g.heading]), along, side])
+            turn = float(g.log(found.T_target_source)[g.heading])
+            seconds, metres, *stated = [float(s[b] - s[a]) for s in sums]
+            scaled = turn if abs(turn) > TURN else 0.0
+            rows.append([apart, seconds, metres, scaled, abs(turn), *stated, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
         raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
     near = sum(row[0] == 1 for row in rows)
@@ -257,15 +262,13 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
     p = matched_pairs(steps, most)
     estimates, notes, noise, cover = _heading(p)
     scale, moved = _distance(p)
-    estimates.append(scale)
     noise |= moved
-    data = f"{len(p)} scan matches"
     kind = "scans" if steps.dim == 2 else "clouds"
     if steps.dim == 3:
         text = f"odometry noise: upper limit {noise['along_metre']:.3g} m/√m and "
         text += f"{math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m — limited by scan matching."
         notes.append(Finding("", "calibrated", text))
-    found = calibration_of(kind, estimates, noise, notes, data)
+    found = calibration_of(kind, [*estimates, scale], noise, notes, f"{len(p)} scan matches")
     if kind == "scans" and not found.contradictions():
         found = replace(found, corrections=replace(found.corrections, heading_cover=cover))
     return found if found.contradictions() else found.validated(cross_validate(p, found, widen=kind == "scans"))
@@ -361,7 +364,12 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
     columns = {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn}
     names, notes = list(HEADING), list[Finding]()
     grows = np.column_stack([p.metres, p.turned, p.seconds])
-    full = regress_errors(p.heading, np.column_stack([columns[n] for n in names]), grows)
+
+    def fit(names: list[str], rows: Any = slice(None), **options: Any) -> Regression:
+        A = np.column_stack([columns[n] for n in names] or [p.metres[:, None][:, :0]])
+        return regress_errors(p.heading[rows], A[rows], grows[rows], **options)
+
+    full = fit(names)
     for pair in (("yaw_bias", "turn_per_metre"), ("turn_scale", "turn_per_metre"), ("yaw_bias", "turn_scale")):
         if not set(pair) <= set(names):
             continue
@@ -370,35 +378,32 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
         rho = float(C[i, j] / math.sqrt(C[i, i] * C[j, j]))
         if abs(rho) > ALIKE:
             rest = [[n for n in names if n != drop] for drop in pair]
-            tried = [regress_errors(p.heading, np.column_stack([columns[n] for n in r]), grows, trim=0) for r in rest]
-            names = rest[int(tried[1].score < tried[0].score)]
-            full = regress_errors(p.heading, np.column_stack([columns[n] for n in names]), grows)
-            kept = next(n for n in pair if n in names)
+            names = min(rest, key=lambda r: fit(r, trim=0).score)
+            full = fit(names)
             text = (
                 f"errors of {NAMES[pair[0]]} and {NAMES[pair[1]]}: correlation {rho:.2f} in this log — only an error "
-                "of "
             )
-            text += f"{NAMES[kept]} is estimated."
-            notes.append(Finding("", "calibrated", text))
-    out = []
-    groups = [p.apart == a for a in np.unique(p.apart)]
-    parts = []
-    for mine in (groups[0], groups[-1]):
-        A = np.column_stack([columns[n][mine] for n in names])
-        parts.append(regress_errors(p.heading[mine], A, grows[mine][:, :1]))
-    for k, name in enumerate(names):
-        sd = math.sqrt(full.covariance[k, k])
-        gain = math.nan
-        if abs(full.value[k]) > SIGNIFICANT * sd:
-            others = np.column_stack([columns[n] for n in names if n != name] or [p.metres[:, None][:, :0]])
-            gain = regress_errors(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
-        out.append(_gated(name, full, parts, k, gain))
-    s = full.sigmas
-    removed = np.array([e.applied for e in out]) * full.value
-    errors = p.heading - np.column_stack([columns[n] for n in names]) @ removed
-    cover = heading_cover(errors, grows @ s[1:] ** 2, p.stated_heading) if len(p) >= MANY else None
-    noise = {"heading_metre": float(s[1]), "heading_radian": float(s[2]), "heading_second": float(s[3])}
-    return out, notes, noise, cover
+            notes.append(Finding("", "calibrated", f"{text}of {NAMES[(set(pair) & set(names)).pop()]} is estimated."))
+    unused: list[Estimate] = []
+    while True:
+        out, A = list[Estimate](), np.column_stack([columns[n] for n in names])
+        ends = (p.apart == p.apart.min(), p.apart == p.apart.max())
+        parts = [regress_errors(p.heading[m], A[m], grows[m][:, :1]) for m in ends]
+        for k, name in enumerate(names):
+            gain = math.nan
+            if abs(full.value[k]) > SIGNIFICANT * math.sqrt(full.covariance[k, k]):
+                gain = fit([n for n in names if n != name], full.keep, trim=0).score - full.score
+            out.append(_gated(name, full, parts, k, gain))
+        applied = [e.name for e in out if e.applied]
+        unused += [e for e in out if not e.applied]
+        if len(applied) in (0, len(names)):
+            break
+        names = applied  # the others are not removed, so their part must not be missing in these
+        full = fit(names)
+    errors = p.heading - A @ (full.value if applied else 0.0 * full.value)
+    cover = heading_cover(errors, grows @ full.sigmas[1:] ** 2, p.stated_heading) if len(p) >= MANY else None
+    noise = dict(zip(("heading_metre", "heading_radian", "heading_second"), full.sigmas[1:].tolist()))
+    return [e for e in out if e.applied] + unused, notes, noise, cover
 
 
 def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: float) -> Estimate:
@@ -418,11 +423,9 @@ def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
     parts = [regress_errors(p.along[m], A[m], grows[m]) for m in (p.apart == p.apart.min(), p.apart == p.apart.max())]
     gain = math.nan
     if abs(full.value[0]) > SIGNIFICANT * math.sqrt(full.covariance[0, 0]):
-        keep = full.keep
-        gain = regress_errors(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
+        gain = regress_errors(p.along[full.keep], A[full.keep][:, :0], grows[full.keep], trim=0).score - full.score
     raw = _gated("distance_scale", full, parts, 0, gain)
     # (odometry - match) / match is the factor minus 1
-    value = math.log1p(max(raw.value, -0.9))
-    scale = replace(raw, value=value, other=math.log1p(max(raw.other, -0.9)))
+    scale = replace(raw, value=math.log1p(max(raw.value, -0.9)), other=math.log1p(max(raw.other, -0.9)))
     side = regress_errors(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
     return scale, {"along_metre": float(full.sigmas[1]), "lateral_metre": float(side.sigmas[1])}

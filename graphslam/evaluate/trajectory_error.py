@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, ArrayLike, align_se2, rotation2, se2_between, se2_compose, se2_inverse
+from graphslam.core.geometry import Array, ArrayLike, align_se2, rotation2
+from graphslam.core.poses import group_of
 from graphslam.core.records import check_times
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.statistics import ErrorStatistics
@@ -116,9 +117,7 @@ def fit_alignment(reference: Array, estimate: Array, alignment: Alignment) -> tu
     if alignment == "none":
         return (np.zeros(3) if planar else np.array([0.0, 0, 0, 0, 0, 0, 1])), 1.0
     if alignment == "origin":
-        if planar:
-            return se2_compose(reference[0], se2_inverse(estimate[0])), 1.0
-        return se3.se3_compose(reference[0], se3.se3_inverse(estimate[0])), 1.0
+        return group_of(reference).compose(reference[0], group_of(reference).inverse(estimate[0])), 1.0
     if alignment not in ("se", "sim"):
         raise DataError("unknown alignment", got=alignment, wanted="none, origin, se or sim")
     dim = 2 if planar else 3
@@ -161,8 +160,7 @@ def _pair(
     ref, est = reference.interpolate(np.clip(estimate.times[j], *reference.times[[0, -1]])), estimate.poses[j].copy()
     T, scale = fit_alignment(ref, est, alignment)
     est[:, : reference.dim] *= scale
-    compose = se2_compose if reference.dim == 2 else se3.se3_compose
-    return estimate.times[j], ref, compose(np.broadcast_to(T, est.shape), est), T, scale
+    return estimate.times[j], ref, group_of(est).compose(np.broadcast_to(T, est.shape), est), T, scale
 
 
 def _size(error: Array) -> tuple[Array, Array]:
@@ -185,8 +183,7 @@ def ate(
         Largest difference of associated stamps [s].
     """
     times, ref, est, T, scale = _pair(reference, estimate, alignment, max_diff)
-    between = se2_between if reference.dim == 2 else se3.se3_between
-    translation, rotation = _size(between(ref, est))
+    translation, rotation = _size(group_of(est).between(ref, est))
     return TrajectoryError(
         kind="ATE",
         alignment=alignment,
@@ -263,7 +260,7 @@ def rpe(
     i, j = delta_pairs(progress, delta, tolerance=relative_tolerance * delta, all_pairs=all_pairs)
     if not len(i):
         raise DataError(f"no two poses are {delta} {unit} apart", got=f"{progress[-1]:.3f} {unit} in all")
-    between = se2_between if reference.dim == 2 else se3.se3_between
+    between = group_of(est).between
     translation, rotation = _size(between(between(ref[i], ref[j]), between(est[i], est[j])))
     return TrajectoryError(
         kind="RPE",

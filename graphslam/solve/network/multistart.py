@@ -156,7 +156,7 @@ def suspicion_of_answer(network: PoseNetwork, end: Optimum) -> str:
         return f"{wound} of {cycles} cycles turn once too often"
     dof = network.residuals - network.states
     if end.objective > dof + BEYOND * np.sqrt(2.0 * max(dof, 1)):
-        return f"chi2 {end.objective:.4g} for {dof} degrees of freedom"
+        return f"chi2 {end.objective:.4g} for {dof} degrees of freedom: wrong edges (try gnc) or too small covariances"
     if 2 * undecided > cycles:
         return f"{undecided} of {cycles} cycles are too noisy to tell turns"
     return ""
