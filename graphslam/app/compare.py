@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
-import pandas as pd
 
 from graphslam.app.memory import MemoryProbe
 from graphslam.core.errors import DataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
 from graphslam.core.progress import Bar
+from graphslam.core.tables import data_frame
 from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
 from graphslam.join.association import MapAssociationConfig
@@ -29,6 +29,8 @@ from graphslam.join.registry import (
 from graphslam.join.submap_solver import SubmapEstimate
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from graphslam.join.graph_join import GraphEstimate
 
 logger = logging.getLogger(__name__)
@@ -208,7 +210,7 @@ def compare_methods(
     with MemoryProbe(submaps if memory else None) as probe:
         for row, megabytes in zip(rows, probe.measure(methods, polish=polish)):
             row["peak_mb"] = megabytes
-    return pd.DataFrame(rows)
+    return data_frame(rows)
 
 
 def submap_keys(submaps: Material) -> list[int]:

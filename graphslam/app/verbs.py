@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
@@ -27,6 +25,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.plugins import plugins
 from graphslam.core.submap import Submap
+from graphslam.core.tables import data_frame
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.join import registry as joining
@@ -39,6 +38,9 @@ from graphslam.solve.solution import Solution
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["compare", "front_ends", "join_submaps", "joiners", "open_run", "options", "refine_path"]
 __all__ += ["solve_graph", "solvers", "worlds"]
@@ -108,7 +110,7 @@ def options(frontend: str | None = None) -> pd.DataFrame:
     >>> table.loc["frontend.particles", "default"]
     '40'
     """
-    return pd.DataFrame([asdict(row) for row in option_rows(frontend)])
+    return data_frame([asdict(row) for row in option_rows(frontend)])
 
 
 def open_run(path: str | Path) -> Run:

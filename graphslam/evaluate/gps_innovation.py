@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
@@ -95,8 +94,8 @@ class GpsInnovations:
             "nis": [_six(v) for v in self.nis],
         }
 
-    def tests(self) -> pd.DataFrame:
-        """Two tests, one row each: ``value`` is 1 if the prediction is consistent, ``low … high`` its two-sided bounds.
+    def tests(self) -> list[dict[str, Any]]:
+        """Two tests, one row each: ``value`` is 1 if consistent, ``low … high`` its two-sided bounds.
 
         ``each``: mean of NIS/dim of the single fixes, bounds by :func:`correlated_dof`; tests the size of the predicted
         covariances. ``joint``: NIS of all fixes together over dim n, bounds by χ²; also tests their correlations.
@@ -126,7 +125,7 @@ class GpsInnovations:
                     "confidence": self.confidence,
                 }
             )
-        return pd.DataFrame(rows)
+        return rows
 
 
 def _six(value: float) -> float:

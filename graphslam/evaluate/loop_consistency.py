@@ -22,11 +22,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 import scipy.sparse as sp
 from scipy import special
 
@@ -36,6 +35,9 @@ from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, 
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
 from graphslam.join.submap_blocks import fuse_repeated, landmark_map_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Ints = npt.NDArray[np.int64]
 MAX_HEADING = 0.2
@@ -317,6 +319,8 @@ class LoopConsistency:
     def table(self) -> pd.DataFrame:
         """One row per loop: submaps, shared landmarks, error of its cycle, D², blame."""
         e = self.loops.errors
+        import pandas as pd
+
         return pd.DataFrame(
             {
                 "a": self.loops.a,

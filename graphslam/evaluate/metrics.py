@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import DataError
@@ -33,6 +32,9 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.solution import Solution
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 logger = logging.getLogger(__name__)
 
 TRUTH_GAP = 0.5
@@ -48,21 +50,8 @@ def is_time(key: object) -> bool:
     return TIMES.search(str(key)) is not None
 
 
-class FigureTable(pd.DataFrame):
-    """A table of values that shows each with six digits: 7, not 7.000000e+00 because another one is small.
-
-    Operations on it return a plain DataFrame.
-    """
-
-    @property
-    def _constructor(self) -> Callable[..., pd.DataFrame]:
-        return pd.DataFrame
-
-    def __repr__(self) -> str:
-        return str(self.to_string(float_format="{:.6g}".format))
-
-    def _repr_html_(self) -> str:
-        return str(self.to_html(float_format="{:.6g}".format))
+COLUMNS = ("key", "value", "unit", "direction")
+"""Columns of the metrics as a table."""
 
 
 @dataclass
@@ -75,9 +64,20 @@ class Metrics:
         """Add one metric; ``direction`` is what is better: lower, higher, one (nearer to 1) or none."""
         self.rows.append({"key": key, "value": float(value), "unit": unit, "direction": direction})
 
-    def table(self) -> pd.DataFrame:
-        """As a table."""
-        return FigureTable(self.rows, columns=["key", "value", "unit", "direction"])
+
+def metric_value(rows: Iterable[Mapping[str, Any]], key: str) -> float:
+    """Value of one row of metrics; KeyError if there is none."""
+    for row in rows:
+        if row["key"] == key:
+            return float(row["value"])
+    raise KeyError(key)
+
+
+def metric_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Metrics as a pandas table, one row each: key, value, unit, and which direction is better."""
+    from graphslam.evaluate.figure_table import FigureTable
+
+    return FigureTable(list(rows), columns=COLUMNS)
 
 
 def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:

@@ -11,16 +11,19 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError
-from graphslam.core.markup import html_frame
+from graphslam.core.markup import html_table
+from graphslam.core.tables import data_frame
 
 if TYPE_CHECKING:
     import pandas as pd
 
+COLUMNS = ("factor_id", "factor", "stream", "t_start", "t_end", "kind", "note")
+"""Columns of the ledger as a table."""
 EXCLUSIVE = "measurement"
 DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
@@ -174,15 +177,16 @@ second time: submap 0 used it over [0.000, 10.000) s
     def __len__(self) -> int:
         return sum(len(es) for es in self._by_factor.values())
 
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per factor and stream, with :data:`COLUMNS`, sorted by time."""
+        return [{c: getattr(e, c) for c in COLUMNS} for e in self.entries()]
+
     def table(self) -> pd.DataFrame:
         """The ledger as a table: one row per factor and stream."""
-        import pandas as pd
-
-        rows = [(e.factor_id, e.factor, e.stream, e.t_start, e.t_end, e.kind, e.note) for e in self.entries()]
-        return pd.DataFrame(rows, columns=["factor_id", "factor", "stream", "t_start", "t_end", "kind", "note"])
+        return data_frame(self.rows(), COLUMNS)
 
     def _repr_html_(self) -> str:
-        return html_frame(self.table())
+        return html_table(self.rows(), COLUMNS)
 
 
 def _overlap(a0: float, a1: float, b0: float, b1: float) -> bool:

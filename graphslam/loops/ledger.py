@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from graphslam.core.errors import DataError
+from graphslam.core.tables import data_frame
 from graphslam.loops.candidates import FRONT_END
 
 if TYPE_CHECKING:
@@ -165,10 +166,8 @@ class LoopLedger:
             out[d.verdict] = out.get(d.verdict, 0) + 1
         return out
 
-    def table(self, *, history: bool = False) -> pd.DataFrame:
+    def rows(self, *, history: bool = False) -> list[dict[str, Any]]:
         """One row per loop with its current decision, or with ``history`` one row per decision."""
-        import pandas as pd
-
         rows = []
         for d in self.decisions if history else self.current():
             row = d.event()
@@ -176,8 +175,12 @@ class LoopLedger:
             row["sigma"] = max((P[k] for k, P in enumerate(d.covariance)), default=math.nan) ** 0.5
             row["fitness"] = gates.get("fitness_known") or gates.get("fitness", math.nan)
             row["margin"] = gates.get("margin", math.nan)
-            rows.append(row)
-        return pd.DataFrame(rows, columns=list(COLUMNS))
+            rows.append({c: row.get(c) for c in COLUMNS})
+        return rows
+
+    def table(self, *, history: bool = False) -> pd.DataFrame:
+        """:meth:`rows` as a pandas table."""
+        return data_frame(self.rows(history=history), COLUMNS)
 
 
 DECIDED = "decided on with all loops"

@@ -42,7 +42,7 @@ def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency) -> Axes:
 def plot_innovations(ax: Axes | None, gps: GpsInnovations, *, title: str | None = None) -> Axes:
     """NIS of every withheld fix over time, with the limit of one fix and the mean with its two-sided bounds."""
     ax = style.new_axes(ax, (8.0, 3.2))
-    each = gps.tests().iloc[0]
+    each = gps.tests()[0]
     t = gps.times - gps.times[0]
     band = f"{gps.confidence:.0%} bounds of the mean, worth {each['dof']:.0f} dof"
     d = gps.dim

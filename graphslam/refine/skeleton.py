@@ -79,7 +79,7 @@ def find_patches(
     outliers : bool
         Remove measurements beyond :data:`OUTLIER` σ.
     """
-    W, _ = cloud.world(poses)
+    W = cloud.world(poses)
     N = rotate_by_step(rotations(poses), cloud.step, surfaces.normals)[surfaces.stands]
     rows = np.flatnonzero(surfaces.flat[surfaces.stands])
     W, N, step, d = W[rows], N[rows], cloud.step[rows], W.shape[1]

@@ -44,12 +44,16 @@ def rotate_by_step(R: Array, step: Index, x: Array, t: Array | None = None) -> A
     out = np.empty(x.shape)
 
     def turn(s: slice) -> None:
-        np.einsum("kij,kj->ki", R[step[s]], x[s], out=out[s])
-        if t is not None:
-            out[s] += t[step[s]]
+        out[s] = _rotated(R, step[s], x[s], t)
 
     over_rows(turn, len(x))
     return out
+
+
+def _rotated(R: Array, step: Index, x: Array, t: Array | None = None) -> Array:
+    """:func:`rotate_by_step` in one block."""
+    turned = np.einsum("kij,kj->ki", R[step], x)
+    return turned if t is None else turned + t[step]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,11 +147,9 @@ class ScanReturns:
         """Number of chunks."""
         return len(self.rows) - 1
 
-    def world(self, poses: Array) -> tuple[Array, Array]:
-        """Points and origins ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
-        R, t = rotations(poses), poses[:, : self.points.shape[1]]
-        W, O = rotate_by_step(R, self.step, self.points, t), rotate_by_step(R, self.step, self.origins, t)
-        return W, O
+    def world(self, poses: Array) -> Array:
+        """Points ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
+        return rotate_by_step(rotations(poses), self.step, self.points, poses[:, : self.points.shape[1]])
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
@@ -185,7 +187,7 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
     normals. A surface goes through its own point, not through the mean of its neighbours: otherwise it would depend on
     points of the next chunk, which are compared with it, and the rounds would converge slowly.
     """
-    W, O = cloud.world(poses)
+    W, R = cloud.world(poses), rotations(poses)
     q, d = W.shape
     normals, flat = np.zeros((q, d)), np.zeros(q, bool)
     tilts = np.zeros((q, d - 1, d), np.float32)
@@ -203,10 +205,11 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
                 yield some, near, tree
 
     def fit(own: Index, near: Index, tree: cKDTree) -> None:
-        normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config, tree)
+        origins = _rotated(R, cloud.step[own], cloud.origins[own], poses[:, :d])
+        normals[own], tilts[own], flat[own] = fit_places(W, origins, own, near, config, tree)
 
     run_tasks(fit, tasks())
-    back = np.swapaxes(rotations(poses), 1, 2)
+    back = np.swapaxes(R, 1, 2)
     for a in range(d - 1):
         tilts[:, a] = rotate_by_step(back, cloud.step, tilts[:, a])
     return Surfaces(rotate_by_step(back, cloud.step, normals), flat, stands, tilts)
@@ -322,22 +325,23 @@ def match_surfaces(
     least_share : float
         Pairs of traversals with a smaller share of paired points are not used.
     """
-    W, O = cloud.world(poses)
-    R = rotations(poses)
+    W, R = cloud.world(poses), rotations(poses)
     N = rotate_by_step(R, cloud.step, surfaces.normals)
     p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, least_share)
-    O -= W
-    beam = np.linalg.norm(O, axis=1)
-    beam[beam == 0] = 1.0
-    del W
     mp, mq = (np.bincount(k, minlength=len(cloud.points))[k] for k in (p, q))
     i, j = cloud.step[p], cloud.step[q]
     shared = None if within is None else [ALIKE * np.bincount(k, minlength=len(within)) for k in (i, j)]
     once, spent = np.zeros((len(p), 3)), np.zeros((len(p), 3))
 
+    def incidence(rows: Index, n: Array) -> Array:
+        """Squared cosine of the angle between beams and normals."""
+        beams = _rotated(R, cloud.step[rows], cloud.origins[rows], poses[:, : W.shape[1]]) - W[rows]
+        length = np.linalg.norm(beams, axis=1)
+        return np.asarray((np.einsum("ki,ki->k", n, beams) / np.where(length == 0, 1.0, length)) ** 2)
+
     def fill(s: slice) -> None:
         a, b, n = p[s], q[s], N[q[s]]
-        cp, cq = (np.asarray((np.einsum("ki,ki->k", n, O[rows]) / beam[rows]) ** 2) for rows in (a, b))
+        cp, cq = incidence(a, n), incidence(b, n)
         once[s, 0], once[s, 1] = cp + cq, 1.0
         spent[s, 0], spent[s, 1] = mp[s] * cp + mq[s] * cq, 0.5 * (mp[s] + mq[s])
         if within is None or shared is None:

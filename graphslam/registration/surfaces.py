@@ -59,14 +59,16 @@ def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Inde
 
 
 def fit_places(
-    W: Array, O: Array, own: Index, near: Index, config: SurfaceFitConfig, tree: cKDTree | None = None
+    W: Array, origins: Array, own: Index, near: Index, config: SurfaceFitConfig, tree: cKDTree | None = None
 ) -> tuple[Array, Array, Flags]:
     """Planes of places among their neighbours.
 
     Parameters
     ----------
-    W, O : (q, d)
-        Points and sensor origins, world [m].
+    W : (q, d)
+        Points, world [m].
+    origins : (k, d)
+        Origins of the beams of the places to fit, world [m].
     own : (k,)
         Rows of the places to fit.
     near : (m,)
@@ -95,5 +97,5 @@ def fit_places(
     with np.errstate(invalid="ignore"):
         good = (w[:, 0] <= config.thickness**2) & (middle >= config.extent**2)
         good &= w[:, 0] <= config.flatness * middle
-    n[np.einsum("ki,ki->k", n, O[own] - W[own]) < 0] *= -1.0
+    n[np.einsum("ki,ki->k", n, origins - W[own]) < 0] *= -1.0
     return n, tilts, good

@@ -30,7 +30,8 @@ from graphslam.core.records import VelocityControls
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
-from graphslam.evaluate.metrics import FigureTable
+from graphslam.evaluate.figure_table import FigureTable
+from graphslam.evaluate.metrics import COLUMNS
 from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.factor_graph import FactorGraph
@@ -67,7 +68,7 @@ def evil(value: Any, depth: int = 0) -> Any:
     if isinstance(value, str):
         return EVIL
     if isinstance(value, dict):
-        return {evil(k, depth): evil(v, depth) for k, v in value.items()}
+        return {k if k in COLUMNS else evil(k, depth): evil(v, depth) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(evil(v, depth) for v in value)
     if isinstance(value, pd.DataFrame):
@@ -81,8 +82,8 @@ def evil(value: Any, depth: int = 0) -> Any:
     return value
 
 
-def metrics() -> pd.DataFrame:
-    return pd.DataFrame([{"key": "k", "value": 1.0, "unit": "m", "direction": "none"}])
+def metrics() -> list[dict[str, Any]]:
+    return [{"key": "k", "value": 1.0, "unit": "m", "direction": "none"}]
 
 
 def graph() -> FactorGraph:
@@ -109,7 +110,9 @@ def a_run(tmp_path: Path) -> Run:
     m = GlobalMap(
         path, path.times, path.poses, path.covariances, NOTHING, np.zeros((0, 2)), np.zeros((0, 2, 2)), NOTHING
     )  # type: ignore[arg-type]
-    return Run(name="run", submaps=[], map=m, metrics=metrics(), report={}, folder=tmp_path / EVIL.replace("/", "|"))
+    return Run(
+        name="run", submaps=[], map=m, metric_rows=metrics(), report={}, folder=tmp_path / EVIL.replace("/", "|")
+    )
 
 
 def a_study(tmp_path: Path) -> Study:
@@ -151,7 +154,7 @@ def a_merge(_: Path) -> MergedMap:
         landmark_sessions=NOTHING,
         solution=nothing,
         graph=nothing,
-        metrics=metrics(),
+        metric_rows=metrics(),
     )
 
 
@@ -170,7 +173,7 @@ CLASS: dict[str, Any] = {
     "least_weight": 1.0,
 }
 MAKERS: dict[str, Callable[[Path], Any]] = {
-    "graphslam.evaluate.metrics.FigureTable": lambda _: FigureTable(metrics()),
+    "graphslam.evaluate.figure_table.FigureTable": lambda _: FigureTable(metrics()),
     "graphslam.core.log.SensorLog": a_log,
     "graphslam.core.findings.Findings": lambda _: Findings([Finding("look", "code", EVIL)]),
     "graphslam.core.submap.Submap": lambda _: submap(),

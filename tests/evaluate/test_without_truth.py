@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -208,7 +209,7 @@ def test_alarm_is_silent_for_consistent_noise_and_fires_for_half_and_double(scal
     verdicts, ratios = [], []
     for seed in range(10):
         graph, withheld = small_run(seed, scale, robust)
-        tests = gps_innovations(graph, withheld).tests()
+        tests = pd.DataFrame(gps_innovations(graph, withheld).tests())
         classes = [c.as_row() for c in class_consistency(graph).values()]
         verdicts += [*tests["verdict"], *(c["verdict"] for c in classes)]
         ratios.append([*tests["value"], *(c["chi2_per_dof"] for c in classes)])
@@ -229,7 +230,7 @@ def test_correlation_between_fixes_is_seen_where_their_size_is_right():
     S = np.eye(2 * n)
     correlated = np.repeat(generator.standard_normal((n // 20, 2)), 20, axis=0)
     g = GpsInnovations(times=np.arange(n, dtype=float), innovations=correlated, covariance=S, unpredicted=0)
-    rows = g.tests().set_index("test")
+    rows = pd.DataFrame(g.tests()).set_index("test")
     assert rows.loc["each", "autocorrelation"] > 10 * rows.loc["each", "white"] / 1.96
     # told of the correlation, the joint test is satisfied with the very same errors plus white ones
     model = np.kron(np.kron(np.eye(n // 20), np.ones((20, 20))), np.eye(2)) + 0.01 * np.eye(2 * n)
@@ -239,7 +240,7 @@ def test_correlation_between_fixes_is_seen_where_their_size_is_right():
         covariance=model,
         unpredicted=0,
     )
-    rows = joint.tests().set_index("test")
+    rows = pd.DataFrame(joint.tests()).set_index("test")
     assert rows.loc["joint", "verdict"] == "consistent"
     assert abs(rows.loc["joint", "autocorrelation"]) < 3 * rows.loc["joint", "white"] / 1.96
     assert rows.loc["each", "dof"] < 30 < rows.loc["joint", "dof"]

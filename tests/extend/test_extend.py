@@ -181,7 +181,7 @@ def test_add_check(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
         return [Finding("look", "few-submaps", f"submaps: {n:g} [≥ 100] — too few.")] if n < 100 else []
 
     monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(few, ("few-submaps",))])
-    figures = RunMetrics.of_table(run.report, run.metrics)
+    figures = RunMetrics.of_rows(run.report, run.metric_rows)
     assert [f.text for f in checks.run_findings(figures) if f.code == "few-submaps"] == [
         "submaps: 7 [≥ 100] — too few."
     ]

@@ -54,7 +54,7 @@ def test_innovations_show_every_fix_and_the_mean_with_its_bounds(rng):
     mean = next(line for line in ax.lines if line.get_label().startswith("mean"))
     assert mean.get_ydata()[0] == pytest.approx(np.mean(gps.nis))
     band = ax.patches[0].get_extents().transformed(ax.transData.inverted())
-    row = gps.tests().iloc[0]
+    row = gps.tests()[0]
     assert (band.y0, band.y1) == pytest.approx((2 * row["low"], 2 * row["high"]))
 
 

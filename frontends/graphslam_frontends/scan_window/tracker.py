@@ -367,9 +367,9 @@ class ScanToWindowOdometry:
         c = max(len(self.lots) - 2, 0)  # the first batch gets surfaces at once: better few neighbours than no window
         around = self.places[max(c - 1, 0) : c + 2]
         own, near = self.places[c], np.concatenate(around)
-        begin = len(around[0]) if c else 0
+        at = (len(around[0]) if c else 0) + np.arange(len(own))
         W, O = self._world(near)
-        normals, _, flat = fit_places(W, O, begin + np.arange(len(own)), np.arange(len(near)), SURFACE)
+        normals, _, flat = fit_places(W, O[at], at, np.arange(len(near)), SURFACE)
         self.normals[own] = np.einsum("kji,kj->ki", self.R[own // self.rows], normals)
         self.flat[c] = own[flat]
         self._plant()

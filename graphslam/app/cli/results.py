@@ -36,8 +36,7 @@ def loops_command(
         ledger = redo_loop(run, redo, progress=not as_json)
     else:
         ledger = loops_of_run(run)
-    frame = ledger.table(history=history)
-    rows = [{str(k): v for k, v in row.items()} for row in frame.to_dict("records")]
+    rows = ledger.rows(history=history)
     counts = ledger.counts()
     shown = rows if every or as_json else [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = len(rows) - len(shown)

@@ -120,7 +120,7 @@ def run_command(
         resume=resume,
         progress=[RunBar(not as_json), *observers],
     )
-    rows = result.metrics.to_dict("records")
+    rows = result.metric_rows
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
     text = _summary(result, out, every)
     if saved:
@@ -144,7 +144,7 @@ def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
 
 def metric_lines(result: Any, every: bool) -> list[str]:
     """Table of the metrics of a run, and the number of hidden ones."""
-    rows = result.metrics.to_dict("records")
+    rows = result.metric_rows
     shown = [r for r in rows if every or r["key"] in SHORT]
     left = len(rows) - len(shown)
     more = [f"({left} more metrics: --all, or metrics.json)"] if left else []
@@ -186,7 +186,7 @@ def join_note(result: Any) -> list[str]:
     from graphslam.app.verdict.figures import CERTAIN
     from graphslam.evaluate.residual_consistency import two_sided_bounds
 
-    m = result.metrics.set_index("key")["value"]
+    m = {r["key"]: r["value"] for r in result.metric_rows}
     chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
     if chi2 is None or not dof > 0:
         return []
@@ -217,7 +217,7 @@ def demo_command(
     from graphslam.app.demo import run_demo
 
     result = run_demo(out, seed=seed, preset=preset, progress=not as_json)
-    rows = result.metrics.to_dict("records")
+    rows = result.metric_rows
     text = (
         f"{chr(10).join(metric_lines(result, every))}"
         f"\n\n{chr(10).join(verdict_text(result.headline, result.verdict))}"

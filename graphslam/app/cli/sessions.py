@@ -42,7 +42,7 @@ def merge_command(
         runs, by=cast(By, by), solver=solver, identity_gate=identity_gate, tolerance=tolerance, out=out,
         surface=SurfaceConfig(voxel=voxel) if surface else None, colour=colour,
     )  # fmt: skip
-    rows = merged.metrics.to_dict("records")
+    rows = merged.metric_rows
     where = f"report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}"
     text = f"{text_table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: {where}"
     print_result({"out": str(out), "metrics": rows, "report": merged.report}, text, as_json=as_json)

@@ -6,12 +6,13 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from graphslam.core.atomic import atomic_open
 from graphslam.core.json_file import json_values
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class OutputFiles:

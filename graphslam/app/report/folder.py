@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import pandas as pd
-
 from graphslam.app.run.files import (
     read_events,
     read_ledger,
@@ -61,7 +59,7 @@ class ReportFolder:
     loops: LoopLedger | None = None
     loop_rows: list[dict[str, Any]] = field(default_factory=list)
     """The rows of ``graphslam loops``, with all gates."""
-    ledger: pd.DataFrame | None = None
+    ledger: list[dict[str, Any]] | None = None
     submaps: list[dict[str, Any]] = field(default_factory=list)
     """Index of the store."""
     clearest: dict[str, Any] | None = None
@@ -198,8 +196,7 @@ def _submap_files(home: Path, entries: list[dict[str, Any]]) -> None:
 
 def _metrics(root: Path, name: str) -> list[dict[str, Any]]:
     """Rows of the metrics; NaN becomes None."""
-    rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root, name).to_dict("records")]
-    return [r if r["value"] == r["value"] else {**r, "value": None} for r in rows]
+    return [r if r["value"] == r["value"] else {**r, "value": None} for r in read_metrics(root, name)]
 
 
 def _index(root: Path) -> list[dict[str, Any]]:
@@ -210,7 +207,7 @@ def _index(root: Path) -> list[dict[str, Any]]:
 
 def _loops(events: list[dict[str, Any]]) -> tuple[LoopLedger | None, list[dict[str, Any]]]:
     ledger = ledger_of_events(events, where="events.jsonl")
-    rows = [{str(k): v for k, v in row.items()} for row in ledger.table().to_dict("records")]
+    rows = ledger.rows()
     for row, d in zip(rows, ledger.current()):
         row["gates"] = {k: v for k, v in (d.gates or {}).items() if v is not None and v == v}
     return ledger, rows

@@ -6,8 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-import pandas as pd
-
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import compact_json, folded_section, missing_note, page_section, remark
 from graphslam.app.run.files import RESUMED
@@ -35,6 +33,7 @@ BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is
 ROUTINE = frozenset(
     {"submap", "attitude", "between", "loop", "match-not-used"}
 )  # reported elsewhere in the page, or once per submap
+Rows = list[dict[str, Any]]
 _UNFINISHED = "the run is not finished."
 
 
@@ -95,10 +94,10 @@ def records_section(folder: ReportFolder) -> Markup:
     return page_section("records", title, *parts)
 
 
-def _use(stream: str, ledger: pd.DataFrame | None) -> str:
+def _use(stream: str, ledger: Rows | None) -> str:
     if ledger is None:
         return "unknown"
-    n = int(ledger.loc[ledger["stream"].astype(str) == stream, "factor_id"].nunique())
+    n = _factors([r for r in ledger if r["stream"] == stream])
     return f"in {n} factor{'s' * (n != 1)}" if n else "in no factor (only for evaluation, or not used)"
 
 
@@ -233,16 +232,15 @@ def evidence_section(folder: ReportFolder) -> Markup:
     title = "Evidence: use of each stream"
     if folder.ledger is None:
         return page_section("evidence", title, missing_note("the ledger of evidence; ", _why(folder, "ledger.csv")))
-    t = folder.ledger.assign(factor=[_kind_of_factor(f) for f in folder.ledger["factor"].astype(str)])
-    if t.empty:
+    rows = [{**r, "factor": _kind_of_factor(r["factor"])} for r in folder.ledger]
+    if not rows:
         return page_section("evidence", title, remark("No measurement was used."))
-    t["length"] = t["t_end"] - t["t_start"]
     groups = []
-    for (stream, factor, kind), of in t.groupby(["stream", "factor", "kind"], sort=True):
-        first, last = float(of["t_start"].min()), float(of["t_end"].max())
+    for (stream, factor, kind), of in _grouped(rows, "stream", "factor", "kind"):
+        first, last = min(r["t_start"] for r in of), max(r["t_end"] for r in of)
         groups.append(
-            {"stream": stream, "factor": factor, "factors": int(of["factor_id"].nunique()), "kind": kind}
-            | {"first": first, "last": last, "seconds": float(of["length"].sum())}
+            {"stream": stream, "factor": factor, "factors": _factors(of), "kind": kind}
+            | {"first": first, "last": last, "seconds": sum(r["t_end"] - r["t_start"] for r in of)}
         )
     columns = {
         **{"stream": "stream", "factor": "used by", "factors": "factors", "kind": "kind", "first": "from [s]"},
@@ -253,17 +251,28 @@ def evidence_section(folder: ReportFolder) -> Markup:
         title,
         html_table(groups, columns),
         html_element("h3", "Declared exceptions"),
-        _exceptions(t),
+        _exceptions([r for r in rows if r["kind"] != EXCLUSIVE]),
         remark("Kind “measurement”: used once; a second use is rejected. All rows are in ledger.csv."),
     )
 
 
-def _exceptions(t: pd.DataFrame) -> Markup:
-    shared = t[t["kind"] != EXCLUSIVE]
-    rows = []
-    for (kind, note), of in shared.groupby(["kind", "note"], sort=True):
-        rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": note})
+def _exceptions(ledger: Rows) -> Markup:
+    rows = [
+        {"kind": kind, "factors": _factors(of), "note": note} for (kind, note), of in _grouped(ledger, "kind", "note")
+    ]
     return html_table(rows, {"kind": "kind", "factors": "factors", "note": "reason"}) if rows else remark("None.")
+
+
+def _grouped(rows: Rows, *columns: str) -> list[tuple[tuple[str, ...], Rows]]:
+    """Rows by equal cells in some columns, sorted by them."""
+    groups: dict[tuple[str, ...], Rows] = {}
+    for r in rows:
+        groups.setdefault(tuple(r[c] for c in columns), []).append(r)
+    return sorted(groups.items(), key=lambda g: g[0])
+
+
+def _factors(ledger: Rows) -> int:
+    return len({r["factor_id"] for r in ledger})
 
 
 def _kind_of_factor(label: str) -> str:

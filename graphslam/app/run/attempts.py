@@ -134,7 +134,7 @@ class _MapCandidates:
         rows = sorted(self.rows, key=lambda r: (r["draw"], r["loops"]))
         rows = [{**r, "kept": (r["draw"], r["loops"]) == (best.draw, best.loops)} for r in rows]
         report = {**best.run.report, "map_attempts": rows}
-        figures = RunMetrics.of_table(report, best.run.metrics, best.run.events)
+        figures = RunMetrics.of_rows(report, best.run.metric_rows, best.run.events)
         lines = run_findings(figures)
         report["verdict"] = verdict_json(summarise_run(figures, lines), lines)
         return replace(best.run, report=report)

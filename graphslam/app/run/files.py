@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from graphslam.app.folders.generations import check_same, current_outputs, read_consistently
 from graphslam.core.atomic import read_json, read_npz
@@ -27,7 +26,6 @@ from graphslam.core.reading import LARGEST, read_text
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
-from graphslam.evaluate.metrics import FigureTable
 from graphslam.loops.ledger import EVENT, LoopDecision, LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 
@@ -243,15 +241,13 @@ def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
     return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
 
 
-def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
-    """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a missing value is NaN."""
+def read_metrics(root: Path, name: str = "metrics.json") -> list[dict[str, Any]]:
+    """Rows of ``metrics.json`` or ``timings.json``: key, value, unit, direction; a missing value is NaN."""
     file = root / name
     rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
-    table = FigureTable(rows, columns=["key", "value", "unit", "direction"])
-    table["value"] = [np.nan if r.get("value") is None else float(r["value"]) for r in rows]
-    for name in ("unit", "direction"):
-        table[name] = [r.get(name) or "" for r in rows]
-    return table
+    value = [np.nan if r.get("value") is None else float(r["value"]) for r in rows]
+    text = [{c: r.get(c) or "" for c in ("unit", "direction")} for r in rows]
+    return [{"key": r["key"], "value": v, **t} for r, v, t in zip(rows, value, text)]
 
 
 def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dict[str, Any]]:
@@ -299,8 +295,8 @@ def _check_decision(event: Mapping[str, Any], where: str) -> None:
         _check_covariances(np.array([P], dtype=np.float64), "covariance of a loop", where)
 
 
-def read_ledger(root: Path) -> pd.DataFrame:
-    """``ledger.csv`` as a table: which factor used which stream in which time interval."""
+def read_ledger(root: Path) -> list[dict[str, Any]]:
+    """Rows of ``ledger.csv``: which factor used which stream in which time interval."""
     file = root / "ledger.csv"
     try:
         lines = list(csv.reader(io.StringIO(read_text(file)), strict=True))
@@ -309,15 +305,15 @@ def read_ledger(root: Path) -> pd.DataFrame:
     head = lines[0] if lines else []
     if lacking := [c for c in LEDGER if head.count(c) != 1]:
         raise FormatError(f"table lacks columns {lacking}, or has them twice", where=str(file), wanted=[*LEDGER])
-    columns: dict[str, list[Any]] = {c: [] for c in LEDGER}
+    rows = []
     for number, row in enumerate(lines[1:], start=2):
         if len(row) != len(head):
             raise FormatError(
                 "row of another length", where=f"{file}, line {number}", got=len(row), wanted=f"{len(head)} columns"
             )
-        for name, kind in LEDGER.items():
-            columns[name].append(_cell(row[head.index(name)], kind, f"{file}, line {number}, column {name}"))
-    return pd.DataFrame(columns).astype({"factor_id": "int64", "t_start": "float64", "t_end": "float64"})
+        where = f"{file}, line {number}, column"
+        rows.append({c: _cell(row[head.index(c)], kind, f"{where} {c}") for c, kind in LEDGER.items()})
+    return rows
 
 
 def _cell(text: str, kind: type, where: str) -> Any:

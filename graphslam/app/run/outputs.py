@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from graphslam.app.folders.generations import FolderTransaction, new_generation, read_consistently
 from graphslam.app.folders.output_files import json_lines
@@ -41,16 +40,19 @@ from graphslam.core.digest import Digest
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
+from graphslam.core.tables import csv_text
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.metrics import FigureTable, is_time
+from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.ledger import COLUMNS
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
 from graphslam.join.graph_problem import JoinProblem
+from graphslam.loops.ledger import COLUMNS as LOOP_COLUMNS
 from graphslam.loops.ledger import LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import base_frames
@@ -134,7 +136,7 @@ def _write_paths(new: FolderTransaction, run: Run) -> None:
         (new.path / name).parent.mkdir(exist_ok=True)
         write_tum(new.path / f"{name}.tum", path)
         inside = [replace(d, verdict="accepted") if d.loop in loops else d for d in current]
-        new.write_text(f"{name}.csv", LoopLedger(inside).table().to_csv(index=False))
+        new.write_text(f"{name}.csv", csv_text(LoopLedger(inside).rows(), LOOP_COLUMNS))
 
 
 def _write_map(new: FolderTransaction, run: Run) -> None:
@@ -177,8 +179,8 @@ def _write_inputs(new: FolderTransaction, run: Run) -> None:
 
 def _write_tables(new: FolderTransaction, run: Run) -> None:
     new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, "generation": run.report["generation"]}, *run.events])
-    if run.ledger is not None:
-        new.write_text("ledger.csv", run.ledger.to_csv(index=False))
+    if run.ledger_rows is not None:
+        new.write_text("ledger.csv", csv_text(run.ledger_rows, COLUMNS))
     new.write_json("metrics.json", metric_rows(run))
     new.write_json("timings.json", timing_rows(run))
     new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
@@ -219,13 +221,13 @@ def _write_marked(new: FolderTransaction, run: Run, name: str, arrays: dict[str,
 
 def metric_rows(run: Run) -> list[dict[str, Any]]:
     """Rows of ``metrics.json``: all metrics except times."""
-    return [r for r in run.metrics.to_dict("records") if not is_time(r["key"])]
+    return [r for r in run.metric_rows if not is_time(r["key"])]
 
 
 def timing_rows(run: Run) -> list[dict[str, Any]]:
     """Rows of ``timings.json``: times, and the number of submaps that were resumed."""
     resumed = {"key": RESUMED, "value": float(run.report.get(RESUMED, 0)), "unit": "", "direction": "none"}
-    return [*(r for r in run.metrics.to_dict("records") if is_time(r["key"])), resumed]
+    return [*(r for r in run.metric_rows if is_time(r["key"])), resumed]
 
 
 def generation_id(run: Run) -> str:
@@ -249,8 +251,9 @@ def landmarks_csv(m: GlobalMap) -> str:
     columns = {"id": m.landmark_ids, **{a: m.landmarks[:, i] for i, a in enumerate(axes)}}
     pairs = [(i, j) for i in range(m.dim) for j in range(i, m.dim)]
     columns |= {f"cov_{axes[i]}{axes[j]}": P[:, i, j] for i, j in pairs}
-    table = pd.DataFrame(columns | {"hits": m.landmark_hits})
-    return str(table.to_csv(index=False, float_format="%.9g"))
+    columns |= {"hits": m.landmark_hits}
+    rows = [{c: f"{v:.9g}" for c, v in zip(columns, row)} for row in zip(*columns.values())]
+    return csv_text(rows, list(columns))
 
 
 def _map_arrays(m: GlobalMap) -> dict[str, Any]:
@@ -316,11 +319,10 @@ def _open(home: Path, root: Path) -> Run:
     metrics = read_metrics(root)
     if (root / "timings.json").is_file():
         timings = read_metrics(root, "timings.json")
-        values = dict(zip(timings["key"], timings["value"]))
-        values = {k: v for k, v in values.items() if v == v}  # NaN: not measured
+        values = {r["key"]: r["value"] for r in timings if r["value"] == r["value"]}  # NaN: not measured
         report[RESUMED] = int(values.pop(RESUMED, 0.0))
         report["seconds"] = {k.removeprefix("seconds_"): v for k, v in values.items() if k.startswith("seconds_")}
-        metrics = FigureTable(pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True))
+        metrics += [r for r in timings if r["key"] != RESUMED]
     if root == home:  # plain files: a copy, or from an older version
         check_state(root)
     _check_submaps(home, root)
@@ -328,10 +330,10 @@ def _open(home: Path, root: Path) -> Run:
         name=str(report["source"]),
         submaps=_identified(home, root),
         map=m,
-        metrics=metrics,
+        metric_rows=metrics,
         report=report,
         events=read_events(root) if (root / "events.jsonl").is_file() else [],
-        ledger=read_ledger(root) if (root / "ledger.csv").is_file() else None,
+        ledger_rows=read_ledger(root) if (root / "ledger.csv").is_file() else None,
         folder=home,
         gps={p.stem.removeprefix("gps_"): read_gps_residuals(p) for p in sorted(root.glob("gps_*.npz"))},
         fixes=read_fixes(root),

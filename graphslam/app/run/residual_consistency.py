@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from graphslam.app.run.config import RunConfig
 from graphslam.backend.streams import split_fixes
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import html_frame
+from graphslam.core.markup import html_table
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.core.tables import data_frame
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.bias_test import sum_bias_windows
 from graphslam.evaluate.covariance_assessment import (
@@ -32,6 +33,11 @@ from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.residual_consistency import NOT_TESTED, ClassConsistency, class_consistency
 from graphslam.graph.factor_graph import FactorGraph
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ("test", "value", "low", "high", "verdict", "dof")
+"""Columns of the checks as a table."""
 OF_THE_MAP = ("submap", "biases", "dense-submap", "match", "loop")
 """Factor classes whose χ² covers motion and observations."""
 MOST_PREDICTED = {2: 1000, 3: 300}
@@ -59,20 +65,23 @@ class ResidualConsistency:
     loops: LoopConsistency | None
     fixes: FixDistances | None = None
 
-    def table(self) -> pd.DataFrame:
+    def rows(self) -> list[dict[str, Any]]:
         """One row per test: value (consistent: 1), two-sided bounds, verdict, and the dof behind the bounds."""
-        columns = ["test", "value", "low", "high", "verdict", "dof"]
         rows = []
         for c in self.classes.values():
             r = c.as_row()
             rows.append((f"chi2 of {c.name}", r["chi2_per_dof"], r["low"], r["high"], r["verdict"], r["dof"]))
         if self.gps is not None:
-            for r in self.gps.tests().to_dict("records"):
+            for r in self.gps.tests():
                 rows.append((f"withheld GPS, {r['test']}", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
         if self.loops is not None:
             r = self.loops.test()
             rows.append(("loops", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
-        return pd.DataFrame(rows, columns=columns)
+        return [dict(zip(COLUMNS, row)) for row in rows]
+
+    def table(self) -> pd.DataFrame:
+        """:meth:`rows` as a pandas table."""
+        return data_frame(self.rows(), COLUMNS)
 
     def evidence(self, submaps: Sequence[Submap], *, refined: bool = False) -> list[ConsistencyTest]:
         """All tests of the covariances (:mod:`graphslam.evaluate.covariance_assessment`).
@@ -100,7 +109,7 @@ class ResidualConsistency:
                 score = c.whiteness.score if c.whiteness.correlated() else min(c.whiteness.score, 0.0)
                 out.append(largest_score_test(f"autocorrelation of {name} residuals", of, score))
         if self.gps is not None:
-            for r in self.gps.tests().to_dict("records"):
+            for r in self.gps.tests():
                 out += chi_square_ratio_test(f"withheld GPS, {r['test']}", "fixes", r["value"], r["dof"])
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
@@ -114,7 +123,7 @@ class ResidualConsistency:
         return out
 
     def _repr_html_(self) -> str:
-        return html_frame(self.table())
+        return html_table(self.rows(), COLUMNS)
 
 
 def check_residual_consistency(
@@ -154,7 +163,7 @@ def check_residual_consistency(
             out.add(f"consistency_{name}_mean_weight", c.mean_weight)
     innovations = _innovations(graph, gps, settings)
     if innovations is not None:
-        for row in innovations.tests().to_dict("records"):
+        for row in innovations.tests():
             for key in ("value", "low", "high", "dof", "autocorrelation", "white", "inside"):
                 direction = "one" if key == "value" else "none"
                 out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)

@@ -8,20 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from graphslam.core.findings import Finding, Findings, findings_of_json, headline_of_json
 from graphslam.core.geometry import se2_transform
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.markup import Markup, html_element, html_frame, inline_picture, join_parts
+from graphslam.core.markup import Markup, html_element, html_table, inline_picture, join_parts
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.core.tables import data_frame
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
+from graphslam.evaluate.metrics import metric_table, metric_value
+from graphslam.graph.ledger import COLUMNS
 from graphslam.maps.global_map import GlobalMap
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from graphslam.app.run.residual_consistency import ResidualConsistency
     from graphslam.app.run.run_inputs import RunInputs
     from graphslam.backend.refining import RefinedRun
@@ -74,13 +78,13 @@ class Run:
     submaps : list of Submap
         With the landmark identities assigned by the back end.
     map : GlobalMap
-    metrics : DataFrame
-        ``key, value, unit, direction``.
+    metric_rows : list of dict
+        ``key, value, unit, direction``; :attr:`metrics` is the table.
     report : dict
         ``run.json``: versions, seed, counts of records read, used and dropped; and the seconds of ``timings.json``.
     events : list of dict
-    ledger : DataFrame or None
-        Which factor used which stream in which time interval.
+    ledger_rows : list of dict or None
+        Which factor used which stream in which time interval; :attr:`ledger` is the table.
     gps : mapping of str to GpsResiduals
         ``all`` and, if GPS is in the graph, ``withheld``.
     fixes : Gps or None
@@ -121,10 +125,10 @@ class Run:
     name: str
     submaps: Sequence[Submap]
     map: GlobalMap
-    metrics: pd.DataFrame
+    metric_rows: list[dict[str, Any]]
     report: dict[str, Any]
     events: list[dict[str, Any]] = field(default_factory=list)
-    ledger: pd.DataFrame | None = None
+    ledger_rows: list[dict[str, Any]] | None = None
     gps: dict[str, GpsResiduals] = field(default_factory=dict)
     fixes: Gps | None = None
     folder: Path | None = None
@@ -152,7 +156,17 @@ class Run:
         ------
         KeyError
         """
-        return metric_value(self.metrics, key)
+        return metric_value(self.metric_rows, key)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The metrics as a table, one row each: ``key``, ``value``, ``unit``, ``direction`` (what is better)."""
+        return metric_table(self.metric_rows)
+
+    @property
+    def ledger(self) -> pd.DataFrame | None:
+        """Which factor used which stream in which time interval, as a table; None in runs of older versions."""
+        return None if self.ledger_rows is None else data_frame(self.ledger_rows, COLUMNS)
 
     @property
     def verdict(self) -> Findings:
@@ -172,7 +186,11 @@ class Run:
     @property
     def points_of_survey(self) -> int:
         """Control rows and check rows that were used."""
-        return int(self.report.get("control_points", {}).get("used", 0)) + len(self.check_points)
+        return int(self.report.get("control_points", {}).get("used", 0)) + len(self._check_rows)
+
+    @property
+    def _check_rows(self) -> list[dict[str, Any]]:
+        return list(self.report.get("check_points", {}).get("rows", []))
 
     @property
     def check_points(self) -> pd.DataFrame:
@@ -180,7 +198,7 @@ class Run:
         ``sigma`` [m], ``nis``, ``dof``; empty if the run had no check rows. Their joint test is in
         ``report["check_points"]``."""
         columns = ["line", "name", "place", "frame", "error", "sigma", "nis", "dof"]
-        return pd.DataFrame(self.report.get("check_points", {}).get("rows", []), columns=columns)
+        return data_frame(self._check_rows, columns)
 
     def to_pandas(self) -> pd.DataFrame:
         """:attr:`trajectory` as a table, one row per pose (:meth:`Trajectory.to_pandas`)."""
@@ -256,14 +274,14 @@ class Run:
         where = f" in {self.folder.name}" if self.folder else ""
         summary = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
         weighty = Findings(f for f in self.verdict if f.level in ("look", "bad"))
-        figures = html_frame(self.metrics[["key", "value", "unit"]])
+        figures = html_table(self.metric_rows, ["key", "value", "unit"])
         return join_parts(
             [
                 html_element("p", html_element("b", self.headline.text)),
                 html_element("p", html_element("b", f"Run of {self.name}"), summary),
                 weighty._repr_html_(),
                 self._picture(),
-                html_element("details", html_element("summary", f"{len(self.metrics)} figures"), figures),
+                html_element("details", html_element("summary", f"{len(self.metric_rows)} figures"), figures),
             ]
         )
 
@@ -274,11 +292,3 @@ class Run:
         if len(self.map.trajectory) < 2:
             return None
         return inline_picture(figure_png(self.plot()), f"Map of {self.name}")
-
-
-def metric_value(metrics: pd.DataFrame, key: str) -> float:
-    """Value of one row of a table of metrics (``key, value, …``)."""
-    row = metrics[metrics["key"] == key]
-    if row.empty:
-        raise KeyError(key)
-    return float(row["value"].iloc[0])

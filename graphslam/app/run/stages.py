@@ -192,10 +192,10 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
         name=inputs.log.name,
         submaps=identified,
         map=made.map,
-        metrics=made.out.table(),
+        metric_rows=list(made.out.rows),
         report=report,
         events=list(slam.back.graph.events),
-        ledger=made.ledger.table(),
+        ledger_rows=made.ledger.rows(),
         gps=made.residuals,
         fixes=fixes,
         inputs=inputs,
@@ -387,7 +387,7 @@ def _verdict(made: SolvedMap, report: dict[str, Any]) -> None:
     used = frozenset().union(*(s.uses | s.assisting_streams for s in submaps))
     streams = stream_use(log, graph, settings, dropped, used)
     report["streams"] = [s.as_row() for s in streams]
-    figures = RunMetrics.of_table(report, made.out.table(), graph.events)
+    figures = RunMetrics.of_rows(report, made.out.rows, graph.events)
     reports = [s.report for s in submaps]
     join = figures.metrics.get("join_chi2_per_dof"), figures.metrics.get("join_dof", 0.0)
     corrected = "noise" in made.config.get("frontend", {})

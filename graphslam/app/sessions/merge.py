@@ -228,7 +228,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
         landmark_sessions=seen_by[keep],
         solution=solution,
         graph=graph,
-        metrics=metrics,
+        metric_rows=metrics,
         report=report,
     )
 

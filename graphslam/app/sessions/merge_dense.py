@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
 
-from graphslam.app.run.run import Run, metric_value
+from graphslam.app.run.run import Run
 from graphslam.app.sessions.dense import session_of
 from graphslam.backend.sessions import (
     SESSION,
@@ -25,12 +24,15 @@ from graphslam.core.geometry import Array
 from graphslam.core.plan_view import plan_path
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.metrics import Metrics, base_metrics
+from graphslam.evaluate.metrics import Metrics, base_metrics, metric_table, metric_value
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 By = Literal["auto", "places", "gps"]
 
@@ -74,12 +76,17 @@ class MergedSubmaps:
     sessions: list[PlacedSession]
     solution: Solution
     graph: FactorGraph
-    metrics: pd.DataFrame
+    metric_rows: list[dict[str, Any]]
     report: dict[str, Any] = field(default_factory=dict)
 
     def metric(self, key: str) -> float:
         """Value of one metric; KeyError if there is none."""
-        return metric_value(self.metrics, key)
+        return metric_value(self.metric_rows, key)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The metrics as a table, one row each: ``key``, ``value``, ``unit``, ``direction`` (what is better)."""
+        return metric_table(self.metric_rows)
 
     def plot(self, ax: Any = None) -> Any:
         """The paths of all sessions from above, with their ellipses."""
@@ -182,7 +189,7 @@ def _placed(
     return out
 
 
-def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFrame:
+def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> list[dict[str, Any]]:
     """Metrics of a merged graph.
 
     ``path_rmse_aligned`` uses one common alignment of all sessions to one ground truth, if the logs share its world, so
@@ -207,7 +214,7 @@ def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFram
             out.add(f"{s.name}_ties", len(s.attached.used))
             out.add(f"{s.name}_ties_dropped", s.attached.dropped)
     _score(out, placed)
-    return out.table()
+    return out.rows
 
 
 def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
@@ -230,7 +237,7 @@ def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
         shift = times[-1][-1] + 1.0 - min(path.times[0], 0.0)
         if s.attached is not None:
             base_metrics(out, s.name, s.T_world_base, T, s.covariance)
-        if "path_rmse_aligned" in set(s.run.metrics["key"]):
+        if any(r["key"] == "path_rmse_aligned" for r in s.run.metric_rows):
             out.add(f"{s.name}_path_rmse_alone", s.run.metric("path_rmse_aligned"), "m", "lower")
     both = Trajectory(np.concatenate(times), np.concatenate(estimated))
     whole = ate(both, Trajectory(both.times, np.concatenate(true)), alignment="se")

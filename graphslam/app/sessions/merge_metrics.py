@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_transform
@@ -29,7 +28,7 @@ def merge_metrics(
     split: int,
     *,
     identities: bool,
-) -> pd.DataFrame:
+) -> list[dict[str, Any]]:
     """Metrics of a merged map; with true identities also errors and NEES, all after *one* rigid alignment.
 
     The alignment fits the landmarks of the whole map to the ground truth, and is used for the paths too, so it does not
@@ -57,7 +56,7 @@ def merge_metrics(
     truth = sessions[0].run.truth
     if truth is not None and identities and len(truth.landmark_ids):
         _score(out, sessions, solution, keep, truth.landmark_ids, truth.landmarks)
-    return out.table()
+    return out.rows
 
 
 def _score(
@@ -99,5 +98,5 @@ def _score(
         error = where - se2_transform(frames.T_truth_estimate, path.positions[a])
         out.add(f"{s.name}_path_rmse", rms(error), "m", "lower")
         for key, name in (("landmark_rmse_aligned", "landmark_rmse_alone"), ("path_rmse_aligned", "path_rmse_alone")):
-            if key in set(s.run.metrics["key"]):
+            if any(r["key"] == key for r in s.run.metric_rows):
                 out.add(f"{s.name}_{name}", s.run.metric(key), "m", "lower")

@@ -18,7 +18,9 @@ from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
 from graphslam.core.lock import lock_folder, make_folder
+from graphslam.core.tables import csv_text
 from graphslam.evaluate.residual_consistency import class_consistency
+from graphslam.graph.ledger import COLUMNS
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save_figure
 
@@ -118,9 +120,9 @@ def _write_dense(folder: FolderTransaction, merged: MergedSubmaps) -> None:
 def _finish(folder: FolderTransaction, merged: MergedMap | MergedSubmaps) -> None:
     """Write the files of both kinds of merged maps."""
     folder.write_lines("events.jsonl", merged.graph.events)
-    folder.write_json("metrics.json", merged.metrics.to_dict("records"))
+    folder.write_json("metrics.json", merged.metric_rows)
     save_figure(merged.plot(), folder.figures / "map.png")
-    folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
+    folder.write_text("ledger.csv", csv_text(merged.graph.ledger.rows(), COLUMNS))
     classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
     report = dict(merged.report)
     seconds = float(report.pop("seconds"))

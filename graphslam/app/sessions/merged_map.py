@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
-from graphslam.app.run.run import Run, metric_value
+from graphslam.app.run.run import Run
 from graphslam.core.geometry import Array
-from graphslam.core.markup import html_element, html_frame, join_parts
+from graphslam.core.markup import html_element, html_table, join_parts
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
+from graphslam.evaluate.metrics import metric_table, metric_value
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.places import Ints
 from graphslam.loops.sessions import Alignment
 from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.solution import Solution
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +68,17 @@ class MergedMap:
     landmark_sessions: Ints
     solution: Solution
     graph: FactorGraph
-    metrics: pd.DataFrame
+    metric_rows: list[dict[str, Any]]
     report: dict[str, Any] = field(default_factory=dict)
 
     def metric(self, key: str) -> float:
         """Value of one metric; KeyError if there is none."""
-        return metric_value(self.metrics, key)
+        return metric_value(self.metric_rows, key)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The metrics as a table, one row each: ``key``, ``value``, ``unit``, ``direction`` (what is better)."""
+        return metric_table(self.metric_rows)
 
     def plot(self, ax: Any = None) -> Any:
         """Landmarks and the path of every session; the ellipses show the uncertainty of the *shape* of the map."""
@@ -89,4 +97,4 @@ class MergedMap:
         return f"MergedMap({len(self.sessions)} sessions, {len(self.landmarks)} landmarks, {shared} of them shared)"
 
     def _repr_html_(self) -> str:
-        return join_parts([html_element("b", repr(self)), html_frame(self.metrics[["key", "value", "unit"]])])
+        return join_parts([html_element("b", repr(self)), html_table(self.metric_rows, ["key", "value", "unit"])])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,9 +36,11 @@ class RunMetrics:
     sessions: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
 
     @classmethod
-    def of_table(cls, report: Mapping[str, Any], metrics: Any, events: Sequence[Mapping[str, Any]] = ()) -> RunMetrics:
-        """From a table of metrics with columns ``key`` and ``value``."""
-        return cls(report, dict(zip(metrics["key"], metrics["value"])), events)
+    def of_rows(
+        cls, report: Mapping[str, Any], rows: Iterable[Mapping[str, Any]], events: Sequence[Mapping[str, Any]] = ()
+    ) -> RunMetrics:
+        """From rows of metrics with ``key`` and ``value``."""
+        return cls(report, {r["key"]: r["value"] for r in rows}, events)
 
     def part(self, name: str) -> Mapping[str, Any]:
         """A mapping in the report; empty if it is missing or no mapping."""

@@ -160,7 +160,7 @@ def consistency(error: Array, covariance: Array) -> dict[str, float]:
 
 def verdict_without_truth(found: Run) -> int:
     """Verdict without ground truth, as an index into :data:`WORDS`."""
-    figures = RunMetrics.of_table(found.report, found.metrics, found.events)
+    figures = RunMetrics.of_rows(found.report, found.metric_rows, found.events)
     lines = [f for f in found.verdict if f.code not in ("headline", "nees")]
     return WORDS.index(run_verdict(lines, [], covariance_assessment(figures))[0])
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pandas as pd
 import pytest
 
 import graphslam as gs
@@ -233,8 +232,8 @@ def test_the_note_on_the_join_is_one_that_consistent_runs_do_not_get(run: Run) -
     """Two-sided bounds at the join's own degrees of freedom; and a cause that a check names comes first."""
 
     def noted(chi2: float, dof: float, verdict: list[Finding]) -> list[str]:
-        metrics = pd.DataFrame({"key": ["join_chi2_per_dof", "join_dof"], "value": [chi2, dof]})
-        return join_note(SimpleNamespace(metrics=metrics, report={"covariance_scale": 1.0}, verdict=verdict))
+        rows = [{"key": "join_chi2_per_dof", "value": chi2}, {"key": "join_dof", "value": dof}]
+        return join_note(SimpleNamespace(metric_rows=rows, report={"covariance_scale": 1.0}, verdict=verdict))
 
     assert join_note(run) == []
     assert noted(1.5, 20, []) == []
