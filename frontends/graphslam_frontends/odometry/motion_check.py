@@ -342,8 +342,8 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
     out: list[Finding] = []
     if found.tried >= LEAST_PAIRS and found.matched < found.least_share * found.tried:
         text = (
-            f"matched pairs of neighbouring scans: {found.matched} of {found.tried} — consecutive scans differ too "
-            "much for a map. Check the ranges, the order of the beams and the mounting."
+            f"matched pairs of neighbouring scans: {found.matched} of {found.tried} — they differ too much for a map,"
+            " or do not show the motion, as in a corridor. Else check ranges, order of the beams and mounting."
         )
         out.append(Finding("look", "scans-unlike", text))
     f = found.fits

@@ -94,7 +94,7 @@ ADVICE: dict[str, str] = {
     "points-without-times": "give the points their times within the scan",
     "motion-uncorrected": "check the stretches that no scan corrects",
     "scans-lost": "check the stretches in which scans were dropped",
-    "scans-unlike": "check the ranges, the order of the beams and the mounting",
+    "scans-unlike": "check the ranges, the order of the beams and the mounting, unless it is a corridor",
     "particles": "use more particles, or rbpf-ekf",
     "one-particle": "use more than one particle",
     "motion-gap": "check the pose after the gap in the motion",
