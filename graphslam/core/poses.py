@@ -71,6 +71,11 @@ def group_of(poses: Any) -> Group:
     return SE2 if size == 3 else SE3
 
 
+def rotation_matrices(poses: Array) -> Array:
+    """Rotation matrices ``(n, dim, dim)`` of poses ``(n, 3|7)``."""
+    return geometry.rotation2(poses[:, 2]) if poses.shape[1] == 3 else se3.quat_to_matrix(poses[:, 3:])
+
+
 def heading_of(poses: ArrayLike) -> Array:
     """Heading ``(...)`` [rad]: direction of the body's x axis in the horizontal plane (yaw of yaw-pitch-roll)."""
     p = np.asarray(poses, dtype=np.float64)

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.geometry import Array
 from graphslam.core.network import Index, Mask, PoseNetwork
-from graphslam.core.poses import Group, group_of
-from graphslam.core.se3 import matrix_to_quat, quat_to_matrix, skew
+from graphslam.core.poses import Group, group_of, rotation_matrices
+from graphslam.core.se3 import matrix_to_quat, skew
 
 log = logging.getLogger(__name__)
 # A rigid motion is not determined if its information is below this share of the largest (lengths relative to the extent
@@ -43,11 +43,6 @@ def _parts(network: PoseNetwork, *, landmarks: bool) -> npt.NDArray[np.int32]:
     size = n + len(network.landmark_ids)
     links = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(size, size))
     return np.asarray(connected_components(links, directed=False)[1][:n])
-
-
-def _matrices(poses: Array) -> Array:
-    """Rotations ``(n, dim, dim)`` of poses."""
-    return rotation2(poses[:, 2]) if poses.shape[1] == 3 else quat_to_matrix(poses[:, 3:])
 
 
 def _motion(group: Group, p: Array, scale: float) -> Array:
@@ -106,7 +101,7 @@ class _Frame(NamedTuple):
         scale = float(np.linalg.norm(p, axis=1).max()) or 1.0
         J = _motion(group, p, scale)[which]
         G = np.einsum("kia,kij,kjb->ab", J, network.information[used][:, group.position, group.position], J)
-        R = _matrices(network.poses[np.append(vertex[0], ends[self.others])])
+        R = rotation_matrices(network.poses[np.append(vertex[0], ends[self.others])])
         for turned, e in zip(R[1:], self.others.tolist(), strict=True):
             C = _tangent(group, turned, network.measurements[e, : group.dim] - middle, scale)
             G += C.T @ network.information[e] @ C
@@ -197,7 +192,9 @@ def align_to_positions(network: PoseNetwork, poses: Array) -> Array:
         p = poses[v, :d] - a
         p[np.linalg.norm(p, axis=1) <= FREE * np.linalg.norm(a)] = 0.0  # rounding is no direction
         B = (z - b).T @ (weight[:, None] * p)
-        turns = _matrices(network.measurements[turned]) @ np.swapaxes(_matrices(poses[network.edges[turned, 1]]), 1, 2)
+        turns = rotation_matrices(network.measurements[turned]) @ np.swapaxes(
+            rotation_matrices(poses[network.edges[turned, 1]]), 1, 2
+        )
         B += ORIENTATION * (float(np.linalg.norm(B)) or 1.0) * turns.sum(axis=0)
         U, _, Vt = np.linalg.svd(B)
         U[:, -1] *= np.sign(np.linalg.det(U @ Vt))

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
-from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_compose, se2_exp, se2_log, se2_transform
+from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.markup import html_element, join_parts
-from graphslam.core.poses import position_covariances
+from graphslam.core.poses import group_of, position_covariances
 from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 from graphslam.core.sketch import plan_sketch
@@ -155,14 +155,12 @@ class Trajectory:
 
     def points(self, lever: ArrayLike) -> Array:
         """World positions ``(n, dim)`` of a point fixed in the body at ``lever`` ``(dim,)``."""
-        if self.dim == 2:
-            return se2_transform(self.poses, np.broadcast_to(lever, (len(self), 2)))
-        return se3.se3_transform(self.poses, np.broadcast_to(lever, (len(self), 3)))
+        return group_of(self.poses).transform(self.poses, np.broadcast_to(lever, (len(self), self.dim)))
 
     def transformed(self, T_new_frame: ArrayLike) -> Trajectory:
         """The same path in another frame; right-tangent covariances do not change."""
-        f = se2_compose if self.dim == 2 else se3.se3_compose
-        return replace(self, poses=f(np.broadcast_to(T_new_frame, self.poses.shape), self.poses))
+        T = np.broadcast_to(T_new_frame, self.poses.shape)
+        return replace(self, poses=group_of(self.poses).compose(T, self.poses))
 
     def take(self, index: Any) -> Trajectory:
         """The poses ``index`` (slice, mask or integer array) as a path: a trajectory can be a stream of a log."""

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_transform
+from graphslam.core.geometry import Array, ArrayLike, align_se2
+from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.evaluate.statistics import ErrorStatistics
 
 Gauge = Literal["first-base", "rigid"]
@@ -72,7 +73,7 @@ def fit_gauge(points: Array, truth: Array, gauge: Gauge) -> Array:
     """``T_truth_estimate`` for points ``(n, 2)`` or ``(n, 3)``: identity, or the rigid least-squares fit."""
     dim = points.shape[1]
     if gauge == "first-base":
-        return np.zeros(3) if dim == 2 else np.array([0.0, 0, 0, 0, 0, 0, 1])
+        return (SE2 if dim == 2 else SE3).identity.copy()
     if gauge != "rigid":
         raise DataError("unknown gauge", got=gauge, wanted="first-base or rigid")
     if len(points) < dim:
@@ -94,11 +95,10 @@ def landmark_error(
     if not len(i):
         raise DataError("no landmark has a truth of the same id", got=len(p), wanted="common ids")
     T = fit_gauge(p[i], q[j], gauge)
-    moved = se2_transform(T, p[i]) if p.shape[1] == 2 else se3.se3_transform(T, p[i])
     return MapError(
         quantity="landmarks",
         gauge=gauge,
         T_truth_estimate=T,
-        errors=np.linalg.norm(moved - q[j], axis=1),
+        errors=np.linalg.norm(group_of(T).transform(T, p[i]) - q[j], axis=1),
         unmatched=len(p) - len(i),
     )

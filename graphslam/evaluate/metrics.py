@@ -13,13 +13,12 @@ import numpy as np
 from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.plan_view import plan_path, plan_pose
-from graphslam.core.poses import group_of
+from graphslam.core.poses import group_of, rotation_matrices
 from graphslam.core.records import Gps
-from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import joint_nees, vector_pose_error
@@ -430,7 +429,7 @@ def end_metrics(
     nees = float(e.ravel() @ np.linalg.solve(P, e.ravel()))
     add_nees(out, "nees", nees, e.size)
     chart = np.zeros((len(poses), g.dof, g.dof))  # right tangents along the axes of the map
-    R = quat_to_matrix(poses[:, 3:]) if g.dim == 3 else rotation2(poses[:, 2])
+    R = rotation_matrices(poses)
     chart[:, g.position, g.position] = R
     if g.dim == 3:
         chart[:, :3, :3] = R

@@ -113,21 +113,21 @@ def fit_alignment(reference: Array, estimate: Array, alignment: Alignment) -> tu
     ``none``; ``origin``: the first poses coincide, heading included; ``se``: rigid least squares on positions; ``sim``:
     with scale (Umeyama 1991).
     """
-    planar = reference.shape[1] == 3
+    g = group_of(reference)
     if alignment == "none":
-        return (np.zeros(3) if planar else np.array([0.0, 0, 0, 0, 0, 0, 1])), 1.0
+        return g.identity.copy(), 1.0
     if alignment == "origin":
-        return group_of(reference).compose(reference[0], group_of(reference).inverse(estimate[0])), 1.0
+        return g.compose(reference[0], g.inverse(estimate[0])), 1.0
     if alignment not in ("se", "sim"):
         raise DataError("unknown alignment", got=alignment, wanted="none, origin, se or sim")
-    dim = 2 if planar else 3
-    q, p = reference[:, :dim], estimate[:, :dim]
+    q, p = reference[:, : g.dim], estimate[:, : g.dim]
     if len(p) < 3:
         raise DataError("too few associated poses to align", got=len(p), wanted="at least 3")
     spread = np.linalg.svd(p - p.mean(0), compute_uv=False)
-    if spread[dim - 2] < 1e-9 * max(1.0, float(np.abs(p).max())):
-        raise DataError("the positions do not determine a rotation", got="a point" if planar else "a point or a line")
-    if not planar:
+    if spread[g.dim - 2] < 1e-9 * max(1.0, float(np.abs(p).max())):
+        got = "a point" if g.dim == 2 else "a point or a line"
+        raise DataError("the positions do not determine a rotation", got=got)
+    if g.dim == 3:
         return se3.align_se3(p, q, scale=alignment == "sim")
     T = align_se2(p, q)
     if alignment == "se":

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from graphslam.core.geometry import Array
+from graphslam.core.poses import rotation_matrices
 from graphslam.core.workers import run_tasks
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
@@ -23,7 +24,6 @@ from graphslam.registration.plane_kernels import (
     plane_blocks,
     plane_residuals,
 )
-from graphslam.registration.surfaces import rotations
 
 Index = npt.NDArray[np.int64]
 
@@ -224,7 +224,7 @@ def surface_residuals(pairs: PlanePairs, cloud: ScanReturns, surfaces: Surfaces,
     """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
     out = np.empty(len(pairs.source))
     t = np.ascontiguousarray(poses[:, : cloud.points.shape[1]])
-    R = rotations(poses)
+    R = rotation_matrices(poses)
 
     def fill(s: slice) -> None:
         plane_residuals(pairs.some(s), R, t, cloud.points, surfaces.normals, out[s])
@@ -254,7 +254,7 @@ def chunk_information(
     if not len(group):
         return no_noise_correction(d)
     w, G = (6 if d == 3 else 3), int(group.max()) + 1
-    R, t = rotations(poses), np.ascontiguousarray(poses[:, :d])
+    R, t = rotation_matrices(poses), np.ascontiguousarray(poses[:, :d])
     x = rotate_by_step(R, pairs.j, cloud.points[pairs.target], t)
     centre: Array = np.stack([np.bincount(group, x[:, k], G) for k in range(d)], axis=1, dtype=np.float64)
     centre /= np.maximum(np.bincount(group, minlength=G), 1)[:, None]
@@ -330,7 +330,7 @@ class RefinementProblem:
         H, g = np.zeros(pattern.size), np.zeros(pattern.widths.sum())
         gp = np.zeros((n, w))
         own = np.arange(n)
-        R, t = rotations(poses), np.ascontiguousarray(poses[:, : motion.group.dim])
+        R, t = rotation_matrices(poses), np.ascontiguousarray(poses[:, : motion.group.dim])
         first, offset = pattern.at(own, own), pattern.at(pairs.i, pairs.j)
         held = holds or no_noise_correction(motion.group.dim)
 

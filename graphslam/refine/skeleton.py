@@ -19,7 +19,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
-from graphslam.core.poses import frame_between, group_of
+from graphslam.core.poses import frame_between, group_of, rotation_matrices
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.refine.config import DISTANCES, MOST_BEAMS, RefineConfig
@@ -29,7 +29,7 @@ from graphslam.refine.problem import LEAST_SPREAD
 from graphslam.refine.refine import CHUNK_LENGTH, CHUNK_TIME, CHUNK_TURN, KEPT, MOST_ROUNDS, STILL
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import SAME_SIDE, ScanReturns, Surfaces, find_surfaces, rotate_by_step
-from graphslam.registration.surfaces import SURFACE, rotations
+from graphslam.registration.surfaces import SURFACE
 from graphslam.skeleton.collapse import number_by_first_observation
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
@@ -80,7 +80,7 @@ def find_patches(
         Remove measurements beyond :data:`OUTLIER` σ.
     """
     W = cloud.world(poses)
-    N = rotate_by_step(rotations(poses), cloud.step, surfaces.normals)[surfaces.stands]
+    N = rotate_by_step(rotation_matrices(poses), cloud.step, surfaces.normals)[surfaces.stands]
     rows = np.flatnonzero(surfaces.flat[surfaces.stands])
     W, N, step, d = W[rows], N[rows], cloud.step[rows], W.shape[1]
     patch, origins, axes = np.zeros(len(rows), np.int64), np.zeros((0, d)), np.zeros((0, d))
@@ -110,7 +110,7 @@ def find_patches(
     if outliers:
         good &= np.abs(r) < OUTLIER * sigma
         good[good] = _shared(patch[good])
-    back = np.swapaxes(rotations(poses), 1, 2)
+    back = np.swapaxes(rotation_matrices(poses), 1, 2)
     normals = rotate_by_step(back, step[good], sums[patch[good]])
     label = np.zeros(0, np.int32)
     if good.any():
@@ -251,7 +251,7 @@ def relax_scans(
         fixes = _fixes(gps, some, poses)
         problem = _problem(some, poses, seen, fixes)
         q = _in_space(poses)
-        found = relax_skeleton(problem, RelaxConfig(split=False, soft=0), Poses(rotations(q), q[:, :3].copy()))
+        found = relax_skeleton(problem, RelaxConfig(split=False, soft=0), Poses(rotation_matrices(q), q[:, :3].copy()))
         before, poses = poses, _from_space(found.poses, g.dim)
         moves.append(float(np.sqrt(np.mean(np.sum((poses - before)[:, : g.dim] ** 2, axis=1)))))
         if progress is not None:
@@ -307,7 +307,7 @@ def _fixes(gps: tuple[Gps, Array] | None, steps: Scans, poses: Array) -> Fixes:
     off = g.transform(g.inverse(T), z.positions[inside]) - antenna
     C = z.sigma[inside, None, None] ** 2 * np.eye(g.dim)
     if z.covariances is not None:
-        R = rotations(np.asarray(T)[None])[0]
+        R = rotation_matrices(np.asarray(T)[None])[0]
         C = R.T @ z.covariances[inside] @ R
     good = np.einsum("ki,ki->k", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]) < chi2_quantile(0.999, g.dim)
     position, wide = np.zeros((int(good.sum()), 3)), np.tile(np.eye(3), (int(good.sum()), 1, 1))
@@ -348,12 +348,12 @@ def _problem(steps: Scans, poses: Array, seen: PatchObservations, fixes: Fixes) 
         normals=normals.astype(np.float32),
         landmark=seen.patch,
         first=np.searchsorted(seen.step, np.arange(n + 1)).astype(np.int64),
-        odometry_rotation=rotations(u),
+        odometry_rotation=rotation_matrices(u),
         odometry_translation=u[:, :3],
         odometry_covariance=C,
         range_sigma=seen.sigma,
         bearing_sigma=PATCH,
-        start_rotation=rotations(start)[0],
+        start_rotation=rotation_matrices(start)[0],
         start_position=start[0, :3],
         start_covariance=np.diag(first**2),
         up=up,

@@ -12,11 +12,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
+from graphslam.core.poses import rotation_matrices
 from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
 from graphslam.core.workers import cores, run_tasks
 from graphslam.refine.scans import Scans
 from graphslam.registration.plane_kernels import PlanePairs
-from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, rotations, thin_places
+from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, thin_places
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -149,7 +150,7 @@ class ScanReturns:
 
     def world(self, poses: Array) -> Array:
         """Points ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
-        return rotate_by_step(rotations(poses), self.step, self.points, poses[:, : self.points.shape[1]])
+        return rotate_by_step(rotation_matrices(poses), self.step, self.points, poses[:, : self.points.shape[1]])
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
@@ -187,7 +188,7 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
     normals. A surface goes through its own point, not through the mean of its neighbours: otherwise it would depend on
     points of the next chunk, which are compared with it, and the rounds would converge slowly.
     """
-    W, R = cloud.world(poses), rotations(poses)
+    W, R = cloud.world(poses), rotation_matrices(poses)
     q, d = W.shape
     normals, flat = np.zeros((q, d)), np.zeros(q, bool)
     tilts = np.zeros((q, d - 1, d), np.float32)
@@ -325,7 +326,7 @@ def match_surfaces(
     least_share : float
         Pairs of traversals with a smaller share of paired points are not used.
     """
-    W, R = cloud.world(poses), rotations(poses)
+    W, R = cloud.world(poses), rotation_matrices(poses)
     N = rotate_by_step(R, cloud.step, surfaces.normals)
     p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, least_share)
     mp, mq = (np.bincount(k, minlength=len(cloud.points))[k] for k in (p, q))

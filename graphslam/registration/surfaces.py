@@ -8,17 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from graphslam.core.geometry import Array, rotation2
-from graphslam.core.se3 import quat_to_matrix
+from graphslam.core.geometry import Array
 from graphslam.registration.plane_kernels import fit_surfaces
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-
-
-def rotations(poses: Array) -> Array:
-    """Rotation matrices ``(n, d, d)`` of poses ``(n, 7|3)``."""
-    return quat_to_matrix(poses[:, 3:]) if poses.shape[1] == 7 else rotation2(poses[:, 2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

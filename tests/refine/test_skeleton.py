@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import DataError, GeometryError
-from graphslam.core.poses import group_of
+from graphslam.core.poses import group_of, rotation_matrices
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.refine.skeleton import find_patches, relax_scans
 from graphslam.refine.surfaces import ScanReturns, find_surfaces, rotate_by_step
-from graphslam.registration.surfaces import SURFACE, rotations
+from graphslam.registration.surfaces import SURFACE
 from tests.refine.test_fixes import DATUM, fixes_along
 from tests.refine.test_plane import started
 from tests.refine.world import court_scans
@@ -83,7 +83,7 @@ def test_each_point_is_in_one_measurement_and_each_pose_sees_a_patch_once(drive)
     assert np.all(np.diff(seen.step) >= 0)
     # points of a patch are on one plane, at the true path
     at = group_of(truth).transform(truth[seen.step], seen.points)
-    n = rotate_by_step(rotations(truth), seen.step, seen.normals)
+    n = rotate_by_step(rotation_matrices(truth), seen.step, seen.normals)
     first = np.unique(seen.patch, return_index=True)[1][seen.patch]
     np.testing.assert_allclose(n, n[first], atol=1e-9)
     far = np.abs(np.einsum("ki,ki->k", at - at[first], n))

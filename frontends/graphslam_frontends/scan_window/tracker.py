@@ -23,9 +23,9 @@ from scipy.spatial import cKDTree
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of
+from graphslam.core.poses import group_of, rotation_matrices
 from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction, plane_blocks, plane_residuals
-from graphslam.registration.surfaces import SURFACE, fit_places, rotations, thin_places
+from graphslam.registration.surfaces import SURFACE, fit_places, thin_places
 from graphslam_frontends.grid.motion import with_roll_pitch
 from graphslam_frontends.grid.weights import evenly_spaced_indices
 from graphslam_frontends.odometry.steps import Steps
@@ -315,7 +315,7 @@ class ScanToWindowOdometry:
         return blocks[0, self.NOW], np.concatenate(list(blocks[1, slots]), axis=1), g[self.NOW]
 
     def _place(self, slot: int, pose: Array) -> Array:
-        self.R[slot], self.t[slot] = rotations(pose[None])[0], pose[: self.group.dim]
+        self.R[slot], self.t[slot] = rotation_matrices(pose[None])[0], pose[: self.group.dim]
         return self.R[slot]
 
     # --- the window --------------------------------------------------------------------------------------------------
@@ -403,7 +403,7 @@ def bias_effects(u: Array, dt: float) -> Array:
     g = group_of(u)
     B = np.zeros((g.dof, 1 + d))
     B[g.heading, 0] = -dt
-    B[g.position, 1:] = rotations(u[None])[0].T @ moved
+    B[g.position, 1:] = rotation_matrices(u[None])[0].T @ moved
     return B
 
 

@@ -30,6 +30,7 @@ import scipy.sparse.linalg as spla
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
+from graphslam.core.poses import rotation_matrices
 from graphslam.graph.network import network_values
 from graphslam.solve.descent import SAME, descend_to_minimum
 from graphslam.solve.network.start import network_arrays
@@ -147,7 +148,7 @@ def isotropic(network: PoseNetwork) -> tuple[Array, Array]:
 
 def _matrices(network: PoseNetwork, poses: Array) -> tuple[Array, Array]:
     p = network.dim
-    return poses[:, :p], rotation2(poses[:, 2]) if p == 2 else se3.quat_to_matrix(poses[:, 3:])
+    return poses[:, :p], rotation_matrices(poses)
 
 
 def residual_matrix(network: PoseNetwork, kappa: Array, tau: Array) -> sp.csr_matrix:

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import Mask, PoseNetwork
-from graphslam.core.poses import group_of
+from graphslam.core.poses import group_of, rotation_matrices
 from graphslam.core.position_priors import align_to_positions, without_position_priors
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import problem_of_network
@@ -187,7 +187,7 @@ def chordal_start(network: PoseNetwork) -> tuple[Array, Array]:
     if part is network:
         return found
     aligned = align_to_positions(network, found[0])
-    turns = rotation2(aligned[:, 2]) if network.dim == 2 else se3.quat_to_matrix(aligned[:, 3:])
+    turns = rotation_matrices(aligned)
     return translations_from(network, turns)
 
 
