@@ -343,6 +343,8 @@ def solve_graph(graph: FactorGraph, solver: str = "lm", **options: Any) -> Solut
     >>> solution.converged, solution.covariance(1, 2).shape
     (True, (3, 3))
     """
+    if not isinstance(graph, FactorGraph):
+        raise DataError("no factor graph", got=type(graph).__name__, wanted="FactorGraph; gs.solve_file solves a file")
     made = registry.make_solver(solver, graph, **options)
     with one_blas_thread():
         made.solve_to_optimum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -66,10 +67,11 @@ class Metrics:
 
 def metric_value(rows: Iterable[Mapping[str, Any]], key: str) -> float:
     """Value of one row of metrics; KeyError if there is none."""
-    for row in rows:
-        if row["key"] == key:
-            return float(row["value"])
-    raise KeyError(key)
+    values = {row["key"]: float(row["value"]) for row in rows}
+    if key not in values:
+        close = ", ".join(difflib.get_close_matches(key, values)) or "none is similar"
+        raise KeyError(f"no metric {key!r} in this run ({close}); run.metrics lists all")
+    return values[key]
 
 
 def metric_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:

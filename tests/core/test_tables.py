@@ -6,8 +6,10 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from graphslam.core.tables import csv_text, data_frame
+from graphslam.evaluate.metrics import metric_value
 
 
 def test_csv_is_that_of_pandas() -> None:
@@ -16,6 +18,13 @@ def test_csv_is_that_of_pandas() -> None:
     assert csv_text(rows, columns) == data_frame(rows, columns).to_csv(index=False)
     assert csv_text([], columns) == "n,x,text\n"
     assert list(data_frame([], columns)) == columns
+
+
+def test_an_unknown_metric_names_similar_ones() -> None:
+    rows = [{"key": "nees_x", "value": 1.0}, {"key": "gap", "value": 2.0}]
+    assert metric_value(rows, "gap") == 2.0
+    with pytest.raises(KeyError, match="nees_x"):
+        metric_value(rows, "nees")
 
 
 def test_a_run_does_not_load_pandas(tmp_path) -> None:

@@ -150,10 +150,11 @@ def evaluate_command(
         value["rpe"] = rpe(est, ref, delta=delta, unit=unit, scale=align == "sim", max_diff=max_diff).as_row()
     except DataError as error:  # a path shorter than delta still has an absolute error
         typer.echo(f"no relative error: {error}; choose another --delta", err=True)
-    text = text_table([{"error": k, **v} for k, v in value.items() if v])
+    errors = {k: v for k, v in value.items() if v}
+    text = text_table([{"": k, **{name: v.get(k) for name, v in errors.items()}} for k in value["ate"]])
     if est.covariances is not None:
         value["nees"] = path_nees(est, ref, max_diff=max_diff)
-        text += "\n" + text_table([value["nees"]])
+        text += "\n\n" + text_table([{"": k, "nees": v} for k, v in value["nees"].items()])
     if plot or save_plot is not None:
         from graphslam.plots.save import save_figure, show_figure
         from graphslam.plots.trajectory import plot_trajectory_error

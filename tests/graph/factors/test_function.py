@@ -190,3 +190,8 @@ def test_one_that_fails_later_is_named():
         graph.add_factor([1], tired, 0.01, evidence=TAPE)
         with pytest.raises(SolverError, match=text):
             gs.solve_graph(graph, solver)
+
+
+def test_a_file_is_no_graph() -> None:
+    with pytest.raises(DataError, match=r"gs\.solve_file"):
+        gs.solve_graph("path.g2o")  # type: ignore[arg-type]
