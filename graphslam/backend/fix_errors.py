@@ -10,7 +10,8 @@ gain in log-likelihood over white noise of any size is above :data:`GATE`; then 
 the previous fix. Without a bias, larger white noise is accepted by the same gate; smaller noise is never used.
 
 Before that, fixes farther than :data:`WILD` σ from the robust optimum are removed, because a Gaussian bias would follow
-them. Without a robust kernel none are removed.
+them; σ is larger than stated if the median distance is, or most fixes of an optimistic receiver would be removed.
+Without a robust kernel none are removed.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy.typing as npt
 from scipy import linalg, optimize
 
 from graphslam.core.errors import IndeterminateError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_graph import FactorGraph
@@ -58,8 +60,9 @@ def fit_fix_errors(graph: FactorGraph) -> FixErrors | None:
     if gps.fitted is not None or len(fixes) < LEAST or any(r.bias is not None or r.stated is None for r in fixes):
         return None
     off = _distances(graph, fixes)
-    wild = [r for r, d in zip(fixes, off) if d > WILD and r.robust.kind != "none"]
-    kept = [r for r, d in zip(fixes, off) if d <= WILD or r.robust.kind == "none"]
+    limit = WILD * max(1.0, float(np.median(off)) / np.sqrt(chi2_quantile(0.5, len(fixes[0].z))))
+    wild = [r for r, d in zip(fixes, off) if d > limit and r.robust.kind != "none"]
+    kept = [r for r, d in zip(fixes, off) if d <= limit or r.robust.kind == "none"]
     if len(kept) < LEAST:
         return None
     try:

@@ -88,6 +88,7 @@ KINDS = {
     "correlated": lambda rng, n: correlated(rng, n, 1.0, 60.0, 2),
     "correlated-white": lambda rng, n: correlated(rng, n, 1.0, 60.0, 2) + 0.3 * rng.standard_normal((n, 2)),
     "multipath": multipath,
+    "optimistic": lambda rng, n: 5.0 * rng.standard_normal((n, 2)),
 }
 
 
@@ -98,6 +99,7 @@ KINDS = {
         ("correlated", 0.1, 1.3, 3.0),
         ("correlated-white", 0.1, 1.3, 3.0),
         ("multipath", 0.3, 1.5, None),
+        ("optimistic", 0.4, 1.4, None),
     ],
 )
 def test_nodes_are_consistent_whatever_the_receiver(rng, kind, low, high, before):
@@ -116,6 +118,8 @@ def test_nodes_are_consistent_whatever_the_receiver(rng, kind, low, high, before
         assert 15.0 < np.median([f.bias_time for f in found]) <= 480.0
     if kind == "white":
         assert sum(f is not None and f.bias_sigma > 0 for f in found) <= 1
+    if kind == "optimistic":
+        assert all(f is not None and f.wild < 8 and (f.bias_sigma > 0 or 4.0 < f.white < 6.0) for f in found), found
     if kind == "multipath":
         assert all(f is not None and 5 < f.wild < 120 for f in found)
 
