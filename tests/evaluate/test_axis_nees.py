@@ -27,7 +27,7 @@ def drawn(rng: np.random.Generator, m: int) -> tuple[np.ndarray, np.ndarray, np.
 def metrics_of(poses: np.ndarray, P: np.ndarray, true: np.ndarray) -> dict[str, float]:
     out = Metrics()
     end_metrics(out, poses, P, true, Trajectory(np.arange(len(poses), dtype=float), poses), None)
-    return dict(zip(out.table()["key"], out.table()["value"]))
+    return {r["key"]: r["value"] for r in out.rows}
 
 
 def test_every_axis_has_its_own_nees_and_a_halved_one_is_found(rng: np.random.Generator) -> None:

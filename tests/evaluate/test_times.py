@@ -10,8 +10,7 @@ from graphslam.evaluate.metrics import Metrics, time_metrics
 def values(seconds: dict[str, float], duration: float) -> dict[str, float]:
     out = Metrics()
     time_metrics(out, seconds, duration, 0.0, np.zeros(0))
-    table = out.table()
-    return dict(zip(table["key"], table["value"]))
+    return {r["key"]: r["value"] for r in out.rows}
 
 
 def test_compilation_is_no_part_of_the_speed() -> None:

@@ -108,7 +108,7 @@ def relax_command(
             from graphslam.plots.refined import plot_scans_along
             from graphslam.plots.save import save_figure
 
-            points = {k: s.cloud.world(p.poses)[0] for k, p in made.paths.items()}
+            points = {k: s.cloud.world(p.poses) for k, p in made.paths.items()}
             save_figure(plot_scans_along(points, made.paths, title=f"scans of {run.name}"), save_plot)
 
     files = [str(f) for f in (out, save_plot) if f is not None]

@@ -106,7 +106,7 @@ def test_scans_that_the_odometry_matched_are_refined_only_if_forced(log, tmp_pat
     assert forced.refined is not None
     assert forced.metric("path_rmse_aligned") < 0.03
     assert forced.metric("path_rmse_aligned_graph") == pytest.approx(run.metric("path_rmse_aligned"))
-    with pytest.raises(ConfigError, match="true, false or always"):
+    with pytest.raises(ConfigError, match="known: True, False, always"):
         RefineConfig(use="sometimes")
 
 
