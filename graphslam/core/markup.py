@@ -153,8 +153,3 @@ def pair_list(values: Mapping[str, Any]) -> Markup:
 def item_list(lines: Iterable[Any]) -> Markup:
     """Lines as a list."""
     return html_element("ul", join_parts((html_element("li", x) for x in lines), "\n"))
-
-
-def html_frame(rows: Any) -> Markup:
-    """A pandas table, in full."""
-    return html_table(rows.to_dict("records"), {c: str(c) for c in rows.columns})

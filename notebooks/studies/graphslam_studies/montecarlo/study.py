@@ -14,7 +14,7 @@ import pandas as pd
 from graphslam.app.folders.generations import new_generation
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
-from graphslam.core.markup import html_element, html_frame, html_table, join_parts
+from graphslam.core.markup import html_element, html_table, join_parts
 from graphslam.core.plugins import plugins
 from graphslam.core.progress import Bar
 from graphslam_studies.montecarlo.definition import GROUP, StudyDefinition, find_study, fingerprint, source_digest
@@ -127,7 +127,11 @@ class Study:
         ]
         try:
             for title, rows in self.report().items():
-                parts.append(html_element("details", html_element("summary", title), html_frame(rows)))
+                parts.append(
+                    html_element(
+                        "details", html_element("summary", title), html_table(rows.to_dict("records"), list(rows))
+                    )
+                )
         except GraphSlamError as error:
             parts.append(html_element("p", f"no report: {error}"))
         return join_parts(parts)
